@@ -1,0 +1,44 @@
+# `make setup` is idempotent: apt packages when root, then a .venv with Seamark and everything it needs.
+SHELL := /bin/bash
+PYTHON ?= python3.11
+VENV := .venv
+STAMP := $(VENV)/.seamark-installed
+
+.PHONY: setup demo test check lint types contracts lock messages clean
+setup: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml docker/apt.sh
+	bash docker/apt.sh
+	$(PYTHON) -m venv --upgrade-deps $(VENV) || { echo "seamark: Python 3.11 with venv is needed (Debian: apt-get install python3.11-venv)" >&2; exit 1; }
+	$(VENV)/bin/python -m pip install --quiet --no-deps --require-hashes -r requirements.lock
+	$(VENV)/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: setup
+	$(VENV)/bin/seamark demo --out demo
+
+test: setup
+	$(VENV)/bin/pytest
+
+check: lint types contracts test
+
+lint: setup
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+
+types: setup
+	$(VENV)/bin/mypy
+
+contracts: setup
+	$(VENV)/bin/lint-imports
+
+# For developers of Seamark: needs uv. The lock names no host; hashes guard what is downloaded.
+lock:
+	uv pip compile --quiet --universal --python-version 3.11 --group sim --group dev --no-header --no-annotate \
+	    --generate-hashes pyproject.toml -o requirements.lock
+
+messages: setup
+	$(VENV)/bin/python -m grpc_tools.protoc -I service --python_out=service --pyi_out=service service/messages.proto
+
+clean:
+	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,1 @@
+"""Worlds with ground truth: SAPIEN-rendered trajectories and a numpy toy world."""

@@ -1,0 +1,1 @@
+"""The front end: images to corners, tracks, visual odometry and keyframes."""

@@ -1,0 +1,1 @@
+"""The service: everything that talks (Zenoh, command line, files, recordings)."""

@@ -1,0 +1,1 @@
+"""The vocabulary: descriptors to visual words, votes and colour histograms to ranked places."""

@@ -1,0 +1,45 @@
+"""What the vocabulary takes and gives."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceObservation:
+    """What one keyframe shows, as far as place recognition goes.
+
+    ``descriptors`` (N, 128) uint8 RootSIFT, ``points`` (N, 2) float32 pixels, ``thumbnail`` (h, w) grey or (h, w, 3) BGR
+    uint8. ``id`` and ``session`` are the keyframe's.
+    """
+
+    id: int
+    session: int
+    stamp_ns: int
+    descriptors: NDArray[np.uint8]
+    points: NDArray[np.float32]
+    thumbnail: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One place that may be the one seen, with its evidence.
+
+    ``score`` fuses votes and histograms, higher is better. ``votes`` is the tf-idf similarity in 0..1. ``jeffrey`` is
+    the Jeffrey divergence of the colour histograms, 0 for equal ones.
+    """
+
+    id: int
+    score: float
+    votes: float
+    jeffrey: float
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The ranked places for one keyframe or query; ``query_id`` is -1 for a query that is not a keyframe."""
+
+    query_id: int
+    stamp_ns: int
+    ranked: tuple[Candidate, ...]
