@@ -5,9 +5,11 @@ The rooms are sub-packages: ``frontend`` (images to odometry and keyframes), ``v
 truth). Conventions of frames, stamps and units are written in :mod:`seamark.frontend.types`.
 """
 
+from importlib.metadata import version
+
 __all__ = ["SeamarkError", "__version__"]
 
-__version__ = "0.1.0"
+__version__ = version("seamark")
 
 
 class SeamarkError(Exception):
