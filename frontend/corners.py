@@ -1,0 +1,87 @@
+"""Corners spread over the image: Harris or Shi-Tomasi response, the best of every free grid cell, sub-pixel refined."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+HARRIS_K = 0.04
+BLOCK_PX = 5
+BORDER_PX = 8
+RELATIVE_RESPONSE = 0.002  # of the image's strongest corners: keeps dark and low-texture images populated
+SUBPIXEL = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 0.02)
+
+
+def corner_response(grey: NDArray[np.uint8], *, harris: bool) -> NDArray[np.float32]:
+    """Return the corner response (H, W) float32 of a grey image taken as 0..1.
+
+    Harris and Stephens (1988) or the smaller eigenvalue of Shi and Tomasi (1994).
+    """
+    image = grey.astype(np.float32) * np.float32(1 / 255)
+    if harris:
+        return cv2.cornerHarris(image, BLOCK_PX, 3, HARRIS_K)
+    return cv2.cornerMinEigenVal(image, BLOCK_PX, ksize=3)
+
+
+def detect_corners(
+    grey: NDArray[np.uint8],
+    occupied: NDArray[np.floating],
+    n_corners: int,
+    *,
+    harris: bool,
+    min_response: float,
+) -> NDArray[np.float32]:
+    """Find new corners (M, 2) float32 in the grid cells that no point of ``occupied`` (N, 2) lies in.
+
+    The grid has about ``n_corners`` cells; M + N stays near ``n_corners`` at most. A cell's corner must exceed
+    ``min_response`` (for Harris its square, the response being a product of two eigenvalues) and a small share of the
+    image's strong corners.
+    """
+    height, width = grey.shape
+    cell = max(8, round(float(np.sqrt(width * height / n_corners))))
+    rows, columns = height // cell, width // cell
+    if rows == 0 or columns == 0:
+        return np.zeros((0, 2), np.float32)
+    response = corner_response(grey, harris=harris)
+    response[:BORDER_PX] = response[-BORDER_PX:] = 0
+    response[:, :BORDER_PX] = response[:, -BORDER_PX:] = 0
+
+    cells = response[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).swapaxes(1, 2)
+    cells = cells.reshape(rows * columns, cell * cell)
+    best = cells.argmax(axis=1)
+    strength = cells[np.arange(len(cells)), best]
+    floor = max(min_response**2 if harris else min_response, RELATIVE_RESPONSE * float(np.quantile(strength, 0.95)))
+    wanted = strength > floor
+
+    if len(occupied):
+        grid = np.floor(np.asarray(occupied) / cell).astype(int)
+        inside = (grid[:, 0] >= 0) & (grid[:, 0] < columns) & (grid[:, 1] >= 0) & (grid[:, 1] < rows)
+        wanted[grid[inside, 1] * columns + grid[inside, 0]] = False
+    chosen = np.flatnonzero(wanted)
+    if len(chosen) == 0:
+        return np.zeros((0, 2), np.float32)
+    y = chosen // columns * cell + best[chosen] // cell
+    x = chosen % columns * cell + best[chosen] % cell
+    points = np.column_stack([x, y]).astype(np.float32)
+    points = _away_from(points, strength[chosen], occupied, 0.5 * cell)
+    if len(points) == 0:
+        return points
+    refined = cv2.cornerSubPix(grey, points.reshape(-1, 1, 2).copy(), (4, 4), (-1, -1), SUBPIXEL).reshape(-1, 2)
+    settled = np.linalg.norm(refined - points, axis=1) < 4
+    return np.ascontiguousarray(refined[settled], np.float32)
+
+
+def _away_from(
+    points: NDArray[np.float32],
+    strength: NDArray[np.float32],
+    occupied: NDArray[np.floating],
+    distance: float,
+) -> NDArray[np.float32]:
+    """Keep the strongest points that are at least ``distance`` from each other and from ``occupied``."""
+    order = np.argsort(-strength, kind="stable")
+    points = points[order]
+    everything = np.vstack([np.asarray(occupied, np.float32).reshape(-1, 2), points])
+    gap = np.linalg.norm(points[:, None] - everything[None], axis=2)
+    first = len(everything) - len(points)
+    rank = np.arange(len(points))
+    gap[rank[:, None] + first <= np.arange(len(everything))[None]] = np.inf  # itself and weaker ones do not count
+    return points[(gap >= distance).all(axis=1)]

@@ -1,0 +1,64 @@
+"""SIFT key points with RootSIFT descriptors, and their matching by ratio and mutual check."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.frontend.types import Features
+
+DESCRIPTOR_SCALE = 512.0  # sqrt of an L1-normalised SIFT bin rarely exceeds 0.5
+
+
+def grey_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the (H, W) grey version of a grey or BGR image."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Map SIFT descriptors (N, 128) to RootSIFT in uint8: Euclidean distance becomes Hellinger's (Arandjelovic 2012)."""
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
+    return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(descriptors / total)), 255).astype(np.uint8)
+
+
+def extract_features(image: NDArray[np.uint8], n_features: int, contrast: float = 0.03) -> Features:
+    """Find at most ``n_features`` SIFT key points (Lowe 2004) in a grey or BGR uint8 image, strongest first."""
+    sift = cv2.SIFT_create(
+        nfeatures=n_features, contrastThreshold=contrast, enable_precise_upscale=True
+    )
+    keypoints, descriptors = sift.detectAndCompute(grey_of(image), None)
+    if descriptors is None or len(keypoints) == 0:
+        return Features.empty()
+    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float32)
+    order = np.lexsort((table[:, 1], table[:, 0], -table[:, 4]))[:n_features]
+    table, descriptors = table[order], descriptors[order]
+    return Features(
+        points=np.ascontiguousarray(table[:, :2]),
+        scales=np.ascontiguousarray(table[:, 2]),
+        angles=np.deg2rad(table[:, 3]),
+        descriptors=root_sift(descriptors),
+    )
+
+
+def match_descriptors(
+    a: NDArray[np.uint8], b: NDArray[np.uint8], *, ratio: float = 0.8
+) -> NDArray[np.int64]:
+    """Match descriptors (N, 128) and (M, 128): index pairs (K, 2) that pass the ratio test both ways and agree."""
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), np.int64)
+    af, bf = a.astype(np.float32), b.astype(np.float32)
+    squared = (af**2).sum(1)[:, None] + (bf**2).sum(1)[None] - 2 * af @ bf.T  # exact: whole numbers below 2^24
+    rows = np.arange(len(a))
+    nearest = squared.argmin(axis=1)
+    first = squared[rows, nearest]
+    second = np.partition(squared, 1, axis=1)[:, 1]
+    mutual = squared.argmin(axis=0)[nearest] == rows
+    keep = mutual & (first < ratio**2 * second)
+    return np.column_stack([rows[keep], nearest[keep]]).astype(np.int64)
+
+
+def thumbnail_of(image: NDArray[np.uint8], longer_side_px: int) -> NDArray[np.uint8]:
+    """Return a copy scaled so that its longer side has ``longer_side_px`` pixels (never enlarged)."""
+    height, width = image.shape[:2]
+    scale = min(1.0, longer_side_px / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
