@@ -1,0 +1,186 @@
+"""The local window: bundle adjustment over the recent keyframes, in numpy with the landmarks eliminated.
+
+Triggs et al., "Bundle Adjustment - A Modern Synthesis" (2000), section 6.1: the reduced camera system has 6 rows per keyframe.
+A window of 8 keyframes and 400 landmarks is one small dense system, so that plain arrays beat a general graph solver here.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.frontend import se3
+from seamark.frontend.camera import Camera
+from seamark.frontend.pose import HUBER, Observations, pose_jacobian, residuals_and_jacobian, retract, robust_weights
+
+INITIAL_DAMPING = 1e-4
+RELATIVE_DECREASE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class WindowKeyframe:
+    """What the window keeps of a keyframe: its pose and what it saw.
+
+    ``track_ids`` (M,) int64 ascending, ``pixels`` (M, 2) ideal, ``inverse_depth`` and ``inverse_sigma`` (M,) NaN where
+    unknown.
+    """
+
+    id: int
+    stamp_ns: int
+    T_odom_cam: NDArray[np.float64]
+    track_ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+    inverse_depth: NDArray[np.float64]
+    inverse_sigma: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BundleProblem:
+    """K poses, L landmarks and O observations, sorted by landmark.
+
+    ``poses`` (K, 4, 4), the first ``n_fixed`` of which hold the gauge, ``landmarks`` (L, 3), ``keyframe_of`` and
+    ``landmark_of`` (O,) indices, ``measured`` what was seen (its ``landmarks`` field is not used).
+    """
+
+    poses: NDArray[np.float64]
+    n_fixed: int
+    landmarks: NDArray[np.float64]
+    keyframe_of: NDArray[np.int64]
+    landmark_of: NDArray[np.int64]
+    measured: Observations
+
+
+@dataclass(frozen=True, eq=False)
+class BundleResult:
+    """The adjusted ``poses`` (K, 4, 4), ``landmarks`` (L, 3) and each observation's error (O,) in pixels."""
+
+    poses: NDArray[np.float64]
+    landmarks: NDArray[np.float64]
+    errors_px: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    cost: float
+    errors_px: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    J_pose: NDArray[np.float64]
+    J_landmark: NDArray[np.float64]
+
+
+def adjust(problem: BundleProblem, camera: Camera, *, pixel_sigma: float, iterations: int) -> BundleResult:
+    """Minimise the robust error of all observations over poses and landmarks (Levenberg-Marquardt)."""
+    poses, landmarks, damping = problem.poses.copy(), problem.landmarks.copy(), INITIAL_DAMPING
+    starts = np.flatnonzero(np.diff(problem.landmark_of, prepend=-1))
+    current = _linearise(problem, poses, landmarks, camera, pixel_sigma)
+    for _ in range(iterations):
+        step = _solve(problem, current, starts, damping)
+        trial_poses = np.stack([retract(T, d) for T, d in zip(poses, step[0], strict=True)])
+        trial_landmarks = landmarks + step[1]
+        trial = _linearise(problem, trial_poses, trial_landmarks, camera, pixel_sigma)
+        if trial.cost < current.cost:
+            decrease = 1 - trial.cost / current.cost
+            poses, landmarks, current, damping = trial_poses, trial_landmarks, trial, damping * 0.1
+            if decrease < RELATIVE_DECREASE:
+                break
+        else:
+            damping *= 10
+    poses = np.stack([se3.orthonormalise(T) for T in poses])
+    return BundleResult(poses, landmarks, current.errors_px)
+
+
+def _linearise(
+    problem: BundleProblem, poses: NDArray[np.float64], landmarks: NDArray[np.float64], camera: Camera, pixel_sigma: float
+) -> _Linearised:
+    R_cam_odom = np.swapaxes(poses[problem.keyframe_of, :3, :3], 1, 2)
+    offset = landmarks[problem.landmark_of] - poses[problem.keyframe_of, :3, 3]
+    in_cam = (R_cam_odom @ offset[:, :, None])[:, :, 0]
+    in_cam[:, 2] = np.maximum(in_cam[:, 2], 1e-2)
+    residuals, J_point = residuals_and_jacobian(in_cam, problem.measured, camera, pixel_sigma)
+    weights = robust_weights(residuals)
+    root = np.sqrt(weights)
+    J_point = J_point * root[:, :, None]
+    return _Linearised(
+        cost=_huber_cost(residuals),
+        errors_px=np.linalg.norm(residuals[:, :2], axis=1) * pixel_sigma,
+        residuals=residuals * root,
+        J_pose=J_point @ pose_jacobian(in_cam),
+        J_landmark=J_point @ R_cam_odom,
+    )
+
+
+def _huber_cost(residuals: NDArray[np.float64]) -> float:
+    norms = np.concatenate([np.linalg.norm(residuals[:, :2], axis=1), np.abs(residuals[:, 2])])
+    return float(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - 0.5 * HUBER)).sum())
+
+
+def _solve(
+    problem: BundleProblem, at: _Linearised, starts: NDArray[np.int64], damping: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the steps of poses (K, 6), zero for fixed ones, and of landmarks (L, 3)."""
+    n_poses, n_landmarks = len(problem.poses), len(problem.landmarks)
+    Jl_t = np.swapaxes(at.J_landmark, 1, 2)
+    H_ll = np.add.reduceat(Jl_t @ at.J_landmark, starts, axis=0)
+    b_l = np.add.reduceat((Jl_t @ at.residuals[:, :, None])[:, :, 0], starts, axis=0)
+    diagonal = np.arange(3)
+    H_ll[:, diagonal, diagonal] *= 1 + damping
+    H_ll[:, diagonal, diagonal] += 1e-9
+    inverse_ll = np.linalg.inv(H_ll)
+
+    W = np.zeros((n_landmarks, n_poses, 6, 3))
+    W[problem.landmark_of, problem.keyframe_of] = np.swapaxes(at.J_pose, 1, 2) @ at.J_landmark
+    W = W.reshape(n_landmarks, n_poses * 6, 3)
+    WH = W @ inverse_ll
+    flat = W.transpose(1, 0, 2).reshape(n_poses * 6, -1)
+    S = -(WH.transpose(1, 0, 2).reshape(n_poses * 6, -1) @ flat.T)
+    b = -np.einsum("lij,lj->i", WH, b_l)
+    for k in range(n_poses):
+        mine = problem.keyframe_of == k
+        J = at.J_pose[mine].reshape(-1, 6)
+        H = J.T @ J
+        H[np.arange(6), np.arange(6)] *= 1 + damping
+        S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += H
+        b[6 * k : 6 * k + 6] += J.T @ at.residuals[mine].reshape(-1)
+
+    free = slice(6 * problem.n_fixed, None)
+    d_poses = np.zeros(6 * n_poses)
+    size = 6 * (n_poses - problem.n_fixed)
+    d_poses[free] = -np.linalg.solve(S[free, free] + 1e-9 * np.eye(size), b[free])
+    reaction = b_l + np.einsum("lij,i->lj", W, d_poses)
+    d_landmarks = -(inverse_ll @ reaction[:, :, None])[:, :, 0]
+    return d_poses.reshape(n_poses, 6), d_landmarks
+
+
+class LandmarkTable:
+    """Positions (3,) in the odometry frame by track id, NaN where unknown; ids only grow and old ones are forgotten."""
+
+    def __init__(self) -> None:
+        self._first_id = 0
+        self._positions = np.full((1024, 3), np.nan)
+
+    def get(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return positions (N, 3); forgotten and new ids are NaN."""
+        index = track_ids - self._first_id
+        known = (index >= 0) & (index < len(self._positions))
+        out = np.full((len(track_ids), 3), np.nan)
+        out[known] = self._positions[index[known]]
+        return out
+
+    def set(self, track_ids: NDArray[np.int64], positions: NDArray[np.float64]) -> None:
+        """Store positions (N, 3)."""
+        if len(track_ids) == 0:
+            return
+        needed = int(track_ids.max()) - self._first_id + 1
+        if needed > len(self._positions):
+            grown = np.full((max(needed, 2 * len(self._positions)), 3), np.nan)
+            grown[: len(self._positions)] = self._positions
+            self._positions = grown
+        index = track_ids - self._first_id
+        self._positions[index[index >= 0]] = positions[index >= 0]
+
+    def forget_before(self, track_id: int) -> None:
+        """Drop everything below an id."""
+        drop = track_id - self._first_id
+        if drop > 4096:
+            self._positions = self._positions[drop:].copy() if drop < len(self._positions) else np.full((1024, 3), np.nan)
+            self._first_id = track_id
