@@ -45,10 +45,10 @@ class KeyframeSummary:
 class RunRecord:
     """Everything that a run found out.
 
-    ``odometry`` has one entry per input frame, in input order, also for frames that could not be read. ``snapshot`` is the
-    map after the last optimisation. ``ground_truth`` is of cam0, or None. ``stages_ms`` maps a stage of the work to all
-    its latencies in ms (frontend stages, verification, optimisation...). ``wall_s`` is from the first frame sent to all
-    nodes drained.
+    ``odometry`` has one entry per input frame, in input order, also for frames that could not be read. ``snapshot`` is
+    the map after the last optimisation. ``ground_truth`` is of cam0, or None. ``stages_ms`` maps a stage of the work to
+    all its latencies in ms (frontend stages, verification, optimisation...). ``wall_s`` is from the first frame sent to
+    all nodes drained. ``deterministic`` says that two such runs must give equal files: wall times are left out of them.
     """
 
     sources: tuple[str, ...]
@@ -60,3 +60,4 @@ class RunRecord:
     processes: tuple[ProcessUsage, ...]
     wall_s: float
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
+    deterministic: bool = False
