@@ -1,7 +1,7 @@
 """Procedural surfaces that look natural enough for SIFT: plaster, brick, wood, tiles, stone, carpet.
 
-Every function takes a random generator, a size in pixels and pixels per metre, because patterns have a natural size, and
-returns a BGR uint8 image (height, width, 3). Nothing is downloaded; the same generator state gives the same picture.
+Every function takes a random generator, a size in pixels and pixels per metre, because patterns have a natural size,
+and returns a BGR uint8 image (height, width, 3). The same state of the generator gives the same picture.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def noise(rng: np.random.Generator, height: int, width: int, cell_px: float, oct
     return (total / np.float32(0.75 * np.sqrt(power))).astype(np.float32)
 
 
-def to_image(values: NDArray[np.floating]) -> Image:
+def to_image(values: NDArray[np.floating] | Image) -> Image:
     """Round and clip (H, W, 3) grey levels to uint8."""
     image: Image = np.clip(np.rint(values), 0, 255).astype(np.uint8)
     return image

@@ -49,12 +49,12 @@ def _room(rng: np.random.Generator) -> list[Panel]:
             row = int(rng.uniform(0.2, 0.9) * PIXELS_PER_METRE)
             image[row : row + height, column : column + width] = prints.poster(rng, height, width)
         panels.append(Panel(left + up, edge, -up, image))
-    for level, down in ((0.0, -2 * y), (z, 2 * y)):
+    for level, depth in ((0.0, -2 * y), (z, 2 * y)):
         surface = textures.FLOORS[int(rng.integers(len(textures.FLOORS)))] if level == 0 else textures.plaster
-        across, back = np.array([2 * x, 0, 0]), np.array([0, down, 0])
+        across, back = np.array([2 * x, 0, 0]), np.array([0, depth, 0])
         image = surface(rng, pixels(back, PIXELS_PER_METRE), pixels(across, PIXELS_PER_METRE), PIXELS_PER_METRE)
         image = prints.add_stickers(rng, image, PIXELS_PER_METRE, 3)
-        panels.append(Panel(np.array([-x, -down / 2, level]), across, back, image))
+        panels.append(Panel(np.array([-x, -depth / 2, level]), across, back, image))
     return panels
 
 
@@ -63,8 +63,8 @@ def _things(rng: np.random.Generator) -> list[Panel]:
     places: list[tuple[Vector, Vector]] = [
         (np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4), 1.4]), np.array([1.0, 1.0, 2.8]))
     ]
-    for corner in range(8):
-        angle = (corner + rng.uniform(0.2, 0.8)) * np.pi / 4
+    for octant in range(8):
+        angle = (octant + rng.uniform(0.2, 0.8)) * np.pi / 4
         size = np.array([rng.uniform(0.4, 0.8), rng.uniform(0.4, 0.8), rng.uniform(0.5, 1.6)])
         direction = np.array([np.cos(angle), np.sin(angle)])
         reach = min(3.9 / max(1e-9, abs(direction[0])), 3.4 / max(1e-9, abs(direction[1])))
@@ -246,7 +246,8 @@ def toy_sequence(
     """Return a run through the toy world of ``seed`` (or through ``world``).
 
     ``loop`` is 1.08 laps on a circle of 2.4 m (16.3 m), ``line`` at most 4 m of 4 cm steps looking 25 degrees aside,
-    ``turn`` at most 2 rad of 2 degree steps on the spot. Raises SeamarkError for another trajectory or fewer than one frame.
+    ``turn`` at most 2 rad of 2 degree steps on the spot. Raises SeamarkError for another trajectory or
+    no frames.
     """
     if n_frames < 1:
         raise SeamarkError(f"a toy sequence needs at least one frame, not {n_frames}")
