@@ -148,7 +148,7 @@ def photograph(rng: np.random.Generator, scene: Image) -> Image:
     light = 0.35 * noise(rng, height, width, 0.7 * width, 2) * rng.uniform(0, 1)
     if rng.random() < 0.4:
         edge = noise(rng, height, width, 0.5 * width, 2)
-        light -= rng.uniform(0.1, 0.5) / (1 + np.exp(-edge * rng.uniform(5, 40)))
+        light -= rng.uniform(0.1, 0.5) / (1 + np.exp(np.clip(-edge * rng.uniform(5, 40), -30, 30)))
     values = 255 * (np.clip(values * (1 + light)[..., None], 0, 255) / 255) ** rng.uniform(0.65, 1.5)
     values = 128 + rng.uniform(0.45, 1.0) * (values - 128) + rng.uniform(-25, 25)
     sigma = float(np.abs(rng.normal(0.5, 0.5)))
@@ -158,7 +158,8 @@ def photograph(rng: np.random.Generator, scene: Image) -> Image:
     image = to_image(values)
     if rng.random() < 0.5:
         _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(55, 96))])
-        image[:] = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        decoded: Image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
+        return decoded
     return image
 
 

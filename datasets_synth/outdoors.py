@@ -94,7 +94,7 @@ def _draw_window(rng: np.random.Generator, canvas: Image, box: tuple[int, int, i
 
 
 def facade(rng: np.random.Generator, height: int, width: int) -> Image:
-    """Return the front of a building: storeys of windows that differ in blinds and glass, and a ground floor of shops."""
+    """Return the front of a building: storeys of windows that differ in blinds and glass, shops on the ground floor."""
     surface = (textures.plaster, textures.brick, textures.stone)[int(rng.integers(3))]
     canvas = surface(rng, height, width, rng.uniform(35, 80))
     columns, storeys = int(rng.integers(3, 9)), int(rng.integers(2, 7))
