@@ -14,6 +14,13 @@ CHI2_3DOF_99 = 11.34
 ITERATIONS = 8
 CONVERGED = 1e-7
 
+# Shared errors of landmarks over one keyframe step: see motion_covariance.
+ROTATION_FLOOR = 5e-4
+ROTATION_PER_RADIAN = 0.005
+ROTATION_PER_METRE = 0.001
+TRANSLATION_FLOOR_M = 0.002
+TRANSLATION_SHARE = 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class Observations:
@@ -159,3 +166,18 @@ def refine_pose(
             break
     spread = float(np.median(np.linalg.norm(residuals[:, :2], axis=1))) / 1.1774  # sigma of a Rayleigh median
     return se3.orthonormalise(T), np.linalg.inv(H) * max(1.0, spread) ** 2
+
+
+def motion_covariance(
+    T_odom_a: NDArray[np.float64], T_odom_b: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of the motion from a to b, of which ``covariance`` is the estimator's own at b.
+
+    The estimator takes the landmarks for exact; what their shared errors add grows with the distance and the angle moved.
+    """
+    distance = float(np.linalg.norm(T_odom_b[:3, 3] - T_odom_a[:3, 3]))
+    angle = float(se3.rotation_angle(T_odom_a[:3, :3].T @ T_odom_b[:3, :3]))
+    sigma_rotation = ROTATION_FLOOR + ROTATION_PER_RADIAN * angle + ROTATION_PER_METRE * distance
+    sigma_translation = TRANSLATION_FLOOR_M + TRANSLATION_SHARE * distance
+    shared = np.diag([sigma_rotation**2] * 3 + [sigma_translation**2] * 3)
+    return covariance + shared

@@ -1,0 +1,100 @@
+"""The start of a mono session: collect views of one set of corners until two of them make a safe first map."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.frontend import se3
+from seamark.frontend.camera import Camera
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.pose import Observations, estimate_pose
+from seamark.frontend.session import Tracks
+from seamark.frontend.two_view import TwoView, initialise
+from seamark.frontend.types import Filled, Frame
+
+MAX_VIEWS = 400
+MIN_SURVIVORS = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one frame saw before there was a map: its ``tracks`` and their ideal ``pixels`` (N, 2)."""
+
+    index: int
+    stamp_ns: int
+    tracks: Tracks
+    pixels: NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class MonoInitialiser:
+    """Views since the ``first`` frame, which will be the first keyframe. ``refusal`` says why the last try failed."""
+
+    first: Frame
+    camera: Camera
+    config: FrontendConfig
+    views: list[View] = field(default_factory=list)
+    refusal: str = "no_view"
+
+    def add(self, frame: Frame, tracks: Tracks) -> None:
+        """Remember where the live tracks are seen in a frame."""
+        pixels = self.camera.undistort(tracks.pixels)
+        self.views.append(View(frame.index, frame.stamp_ns, tracks, pixels))
+
+    @property
+    def exhausted(self) -> bool:
+        """Return whether too few corners of the first frame are left, or it is too long ago, to go on."""
+        alive = len(self.views[-1].tracks.ids)
+        enough = max(self.config.initial_min_landmarks, MIN_SURVIVORS * len(self.views[0].tracks.ids))
+        return alive < enough or len(self.views) > MAX_VIEWS
+
+    def attempt(self) -> tuple[TwoView, NDArray[np.int64]] | None:
+        """Try the first against the newest view; returns the map and the track ids of its landmarks."""
+        first, newest = self.views[0], self.views[-1]
+        ids, i, j = np.intersect1d(first.tracks.ids, newest.tracks.ids, assume_unique=True, return_indices=True)
+        moved = np.linalg.norm(first.pixels[i] - newest.pixels[j], axis=1)
+        if len(ids) == 0 or float(np.median(moved)) < self.config.initial_parallax_px:
+            self.refusal = "little_motion"
+            return None
+        c = self.config
+        result = initialise(
+            first.pixels[i],
+            newest.pixels[j],
+            self.camera,
+            min_parallax_px=c.initial_parallax_px,
+            min_landmarks=c.initial_min_landmarks,
+            min_angle_deg=c.triangulation_min_angle_deg,
+        )
+        if isinstance(result, str):
+            self.refusal = result
+            return None
+        return result, ids
+
+    def fill(
+        self, session: int, reference_id: int, T_odom_reference: NDArray[np.float64], landmark_of: "dict[int, int]",
+        positions: NDArray[np.float64],
+    ) -> tuple[Filled, ...]:
+        """Give the views between the first and the newest their poses against the new landmarks.
+
+        ``landmark_of`` maps track ids to rows of ``positions`` (N, 3) in the odometry frame.
+        """
+        filled = []
+        c = self.config
+        for view in self.views[1:-1]:
+            rows = np.array([landmark_of.get(int(t), -1) for t in view.tracks.ids])
+            known = rows >= 0
+            unknown_depth = np.full(int(known.sum()), np.nan)
+            observations = Observations(positions[rows[known]], view.pixels[known], unknown_depth, unknown_depth)
+            pose = estimate_pose(
+                observations,
+                self.camera,
+                threshold_px=c.pnp_threshold_px,
+                iterations=c.pnp_iterations,
+                pixel_sigma=c.pixel_sigma,
+                minimum=c.min_inliers,
+            )
+            if pose is not None:
+                T = se3.inverse(T_odom_reference) @ pose.T_odom_cam
+                filled.append(Filled(view.index, view.stamp_ns, session, reference_id, T))
+        return tuple(filled)

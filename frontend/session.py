@@ -1,0 +1,185 @@
+"""One session's tracking state: live tracks, landmarks, and the window of recent keyframes."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.frontend import se3
+from seamark.frontend.camera import Camera
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.pose import Observations
+from seamark.frontend.two_view import normalised_rays, triangulate
+from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
+
+OUTLIER_PX = 4.0
+FAR_RELATIVE_SIGMA = 0.35  # a first depth less certain than this waits for triangulation
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Corners followed up to the last frame: ``ids`` (N,) int64 ascending, ``pixels`` (N, 2) float32 as seen."""
+
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float32]
+
+    @staticmethod
+    def none() -> "Tracks":
+        """Return no tracks."""
+        return Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+
+    def __len__(self) -> int:
+        """Return the number of tracks."""
+        return len(self.ids)
+
+    def __getitem__(self, keep: NDArray[np.bool_]) -> "Tracks":
+        """Select by mask."""
+        return Tracks(self.ids[keep], self.pixels[keep])
+
+
+@dataclass(eq=False)
+class Session:
+    """Mutable state between frames. ``velocity`` is T_last_next of the last step; ``reference`` the newest keyframe."""
+
+    id: int
+    config: FrontendConfig
+    camera: Camera
+    metric: bool
+    T_odom_cam: NDArray[np.float64]
+    tracks: Tracks = field(default_factory=Tracks.none)
+    landmarks: LandmarkTable = field(default_factory=LandmarkTable)
+    window: list[WindowKeyframe] = field(default_factory=list)
+    velocity: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    last_pose_stamp_ns: int = 0
+    n_at_keyframe: int = 0
+    next_track_id: int = 0
+
+    @property
+    def reference(self) -> WindowKeyframe:
+        """Return the newest keyframe."""
+        return self.window[-1]
+
+    def new_tracks(self, pixels: NDArray[np.float32]) -> Tracks:
+        """Give ids to new corners (N, 2) and append them to the live tracks; returns the new ones."""
+        fresh = Tracks(np.arange(self.next_track_id, self.next_track_id + len(pixels)), pixels.astype(np.float32))
+        self.next_track_id += len(pixels)
+        self.tracks = Tracks(
+            np.concatenate([self.tracks.ids, fresh.ids]), np.vstack([self.tracks.pixels, fresh.pixels])
+        )
+        return fresh
+
+    def observations(
+        self, tracks: Tracks, inverse_depth: NDArray[np.float64], inverse_sigma: NDArray[np.float64]
+    ) -> tuple[Observations, NDArray[np.bool_]]:
+        """Return what tracks with a landmark say about the pose, and which tracks those are."""
+        positions = self.landmarks.get(tracks.ids)
+        known = np.isfinite(positions[:, 0])
+        pixels = self.camera.undistort(tracks.pixels)
+        return Observations(positions[known], pixels[known], inverse_depth[known], inverse_sigma[known]), known
+
+    def insert_keyframe(
+        self,
+        keyframe_id: int,
+        stamp_ns: int,
+        T_odom_cam: NDArray[np.float64],
+        inverse_depth: NDArray[np.float64],
+        inverse_sigma: NDArray[np.float64],
+    ) -> None:
+        """Add the live tracks as a keyframe: new landmarks from depth or parallax, then adjust the window."""
+        pixels = self.camera.undistort(self.tracks.pixels)
+        self.window.append(
+            WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, self.tracks.ids, pixels, inverse_depth, inverse_sigma)
+        )
+        self._landmarks_from_parallax()
+        del self.window[: -self.config.window_keyframes]
+        self.adjust_window()
+        self._landmarks_from_depth()  # after the adjustment: they hang on this keyframe's pose alone
+        self.T_odom_cam = self.reference.T_odom_cam
+        self.n_at_keyframe = int(np.isfinite(self.landmarks.get(self.tracks.ids)[:, 0]).sum())
+        oldest = min((int(k.track_ids[0]) for k in self.window if len(k.track_ids)), default=self.next_track_id)
+        self.landmarks.forget_before(oldest)
+
+    def _landmarks_from_depth(self) -> None:
+        newest = self.reference
+        missing = np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
+        with np.errstate(invalid="ignore"):
+            usable = missing & (newest.inverse_sigma < FAR_RELATIVE_SIGMA * newest.inverse_depth)
+        rays = normalised_rays(newest.pixels[usable], self.camera)
+        positions = se3.transform(newest.T_odom_cam, rays / newest.inverse_depth[usable, None])
+        self.landmarks.set(newest.track_ids[usable], positions)
+
+    def _landmarks_from_parallax(self) -> None:
+        newest = self.reference
+        todo = np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
+        for older in self.window[:-1]:  # the oldest view first: the widest angle
+            shared, mine, theirs = np.intersect1d(
+                newest.track_ids, older.track_ids, assume_unique=True, return_indices=True
+            )
+            use = todo[mine]
+            if not use.any():
+                continue
+            mine, theirs, shared = mine[use], theirs[use], shared[use]
+            points, angle = triangulate(
+                older.T_odom_cam,
+                normalised_rays(older.pixels[theirs], self.camera),
+                newest.T_odom_cam,
+                normalised_rays(newest.pixels[mine], self.camera),
+            )
+            good = np.isfinite(points[:, 0]) & (angle > np.deg2rad(self.config.triangulation_min_angle_deg))
+            for keyframe, rows in ((older, theirs), (newest, mine)):
+                seen = se3.transform(se3.inverse(keyframe.T_odom_cam), np.where(good[:, None], points, 0))
+                good &= seen[:, 2] > 1e-3
+                safe = np.where(good[:, None], seen, [0, 0, 1])
+                error = np.linalg.norm(self.camera.project_ideal(safe) - keyframe.pixels[rows], axis=1)
+                good &= error < self.config.pnp_threshold_px
+            self.landmarks.set(shared[good], points[good])
+            todo[mine[good]] = False
+
+    def adjust_window(self) -> None:
+        """Bundle-adjust the window and forget landmarks that do not fit; the oldest poses hold the gauge."""
+        n_fixed = 1 if self.metric or len(self.window) == 2 else 2
+        if len(self.window) <= n_fixed:
+            return
+        problem, track_ids = self._bundle_problem(n_fixed)
+        if problem is None:
+            return
+        c = self.config
+        result = adjust(problem, self.camera, pixel_sigma=c.pixel_sigma, iterations=c.window_iterations)
+        if not (np.isfinite(result.poses).all() and np.isfinite(result.landmarks).all()):
+            return
+        starts = np.flatnonzero(np.diff(problem.landmark_of, prepend=-1))
+        worst = np.maximum.reduceat(result.errors_px, starts)
+        positions = np.where((worst < OUTLIER_PX)[:, None], result.landmarks, np.nan)
+        self.landmarks.set(track_ids, positions)
+        self.window = [
+            WindowKeyframe(k.id, k.stamp_ns, T, k.track_ids, k.pixels, k.inverse_depth, k.inverse_sigma)
+            for k, T in zip(self.window, result.poses, strict=True)
+        ]
+
+    def _bundle_problem(self, n_fixed: int) -> tuple[BundleProblem | None, NDArray[np.int64]]:
+        keyframe_of = np.concatenate([np.full(len(k.track_ids), i) for i, k in enumerate(self.window)])
+        ids = np.concatenate([k.track_ids for k in self.window])
+        unique, landmark_of, count = np.unique(ids, return_inverse=True, return_counts=True)
+        positions = self.landmarks.get(unique)
+        wanted = np.isfinite(positions[:, 0]) & (count >= 2)
+        if wanted.sum() < self.config.min_inliers:
+            return None, unique
+        renumber = np.cumsum(wanted) - 1
+        use = np.flatnonzero(wanted[landmark_of])
+        use = use[np.argsort(landmark_of[use], kind="stable")]
+        pixels = np.vstack([k.pixels for k in self.window])[use]
+        measured = Observations(
+            landmarks=np.zeros((len(use), 3)),
+            pixels=pixels,
+            inverse_depth=np.concatenate([k.inverse_depth for k in self.window])[use],
+            inverse_sigma=np.concatenate([k.inverse_sigma for k in self.window])[use],
+        )
+        problem = BundleProblem(
+            poses=np.stack([k.T_odom_cam for k in self.window]),
+            n_fixed=n_fixed,
+            landmarks=positions[wanted],
+            keyframe_of=keyframe_of[use],
+            landmark_of=renumber[landmark_of[use]],
+            measured=measured,
+        )
+        return problem, unique[wanted]
