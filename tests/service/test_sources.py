@@ -183,10 +183,8 @@ class TestEuroc:
         np.testing.assert_allclose(source.rig.T_cam0_cam1[:3, 3], [0.11, 0, 0], atol=1e-12)
         assert source.rig.cam0.distortion == (0, 0, 0, 1e-5)
         assert source.ground_truth is not None
-        half_turn = se3.make(np.diag([-1.0, -1.0, 1.0]), np.array([1.0, 2.0, 3.0]))
-        np.testing.assert_allclose(
-            source.ground_truth.T_world_cam[0, :3, 3], half_turn[:3, :3] @ [0.1, 0.2, 0.3] + [1, 2, 3]
-        )
+        # The body is turned by 180 degrees about z at (1, 2, 3).
+        np.testing.assert_allclose(source.ground_truth.T_world_cam[0, :3, 3], [1 - 0.1, 2 - 0.2, 3 + 0.3])
         np.testing.assert_allclose(source.ground_truth.T_world_cam[0, :3, 0], [0, -1, 0], atol=1e-12)
         got = frames(source)
         assert [f.stamp_ns - got[0].stamp_ns for f in got] == [0, 50_000_000, 100_000_000]
