@@ -1,0 +1,142 @@
+"""Requests over Zenoh, both ends: bounded serving in threads, replies and errors as values."""
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from seamark.service.bus import (
+    BusClosedError,
+    ErrorCode,
+    Handler,
+    RemoteError,
+    TimedOutError,
+    UnavailableError,
+    error_reply,
+)
+from seamark.service.topics import Topic
+from seamark.service.wire import decode, encode, encoding_of
+from seamark.service.zenoh_delivery import TIMEOUT_PAYLOAD, answer, payload_of, refusal, refuse
+
+logger = logging.getLogger(__name__)
+
+
+class Worker:
+    """One thread that runs what is put to it, in order, until closed."""
+
+    def __init__(self, name: str) -> None:
+        self._work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Callable[[], None]) -> None:
+        """Queue one piece of work."""
+        self._work.put(work)
+
+    def close(self) -> None:
+        """Finish the work in hand, forget the rest, and end the thread."""
+        self._closed = True
+        self._work.put(None)
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+        with contextlib.suppress(Empty):
+            while True:
+                self._work.get_nowait()
+
+    def _run(self) -> None:
+        while (work := self._work.get()) is not None and not self._closed:
+            try:
+                work()
+            except Exception:
+                logger.exception("work of %s failed", self._thread.name)
+            del work  # a query that is kept is never ended
+
+
+def all_done(futures: "list[Future[None]]") -> "Future[None]":
+    """Return a Future that is done when all are, with the first error if there is one."""
+    if len(futures) == 1:
+        return futures[0]
+    together, lock, missing = Future[None](), threading.Lock(), len(futures)
+    together.set_running_or_notify_cancel()
+
+    def on_done(_: "Future[None]") -> None:
+        nonlocal missing
+        with lock:
+            missing -= 1
+            if missing:
+                return
+        error = next((error for future in futures if (error := future.exception()) is not None), None)
+        if error is None:
+            together.set_result(None)
+        else:
+            together.set_exception(error)
+
+    for future in futures:
+        future.add_done_callback(on_done)
+    return together
+
+
+def bounded(
+    topic: Topic, limit: int, submit: Callable[[Callable[[], None]], object], process: Callable[[Any], None]
+) -> Callable[[Any], None]:
+    """Return the callback of a queryable: it puts the query aside and refuses it when ``limit`` are waiting."""
+    slots = threading.BoundedSemaphore(limit)
+
+    def run(query: Any) -> None:
+        try:
+            process(query)
+        finally:
+            slots.release()
+
+    def on_query(query: Any) -> None:
+        if not slots.acquire(blocking=False):
+            refuse(query, RemoteError(ErrorCode.BUSY, f"{limit} requests on {topic.name} are waiting; try again later"))
+            return
+        with contextlib.suppress(RuntimeError):  # the pool is closing: no reply, which the asker sees as unavailable
+            submit(lambda: run(query))
+
+    return on_query
+
+
+def server(topic: Topic, callback: Handler) -> Callable[[Any], None]:
+    """Return what answers one query of a request topic."""
+
+    def process(query: Any) -> None:
+        try:
+            reply = encode(callback(decode(payload_of(query), topic.message)))
+        except BusClosedError:
+            return
+        except Exception as error:
+            refuse(query, error_reply(error))
+            return
+        assert topic.reply is not None
+        answer(query, reply, encoding_of(topic.reply))
+
+    return process
+
+
+def on_reply(topic: Topic, future: "Future[Any]", reply: Any, timeout_s: float) -> None:
+    """Settle the Future of a request by a reply or an error reply."""
+    if future.done():
+        return
+    try:
+        if reply.ok is not None:
+            assert topic.reply is not None
+            future.set_result(decode(payload_of(reply.ok), topic.reply))
+            return
+        payload = reply.err.payload.to_bytes()
+        if payload == TIMEOUT_PAYLOAD:
+            raise TimedOutError(f"no reply on topic {topic.name} in {timeout_s:g} s")
+        raise refusal(payload)
+    except Exception as error:
+        future.set_exception(error)
+
+
+def on_end(topic: Topic, future: "Future[Any]") -> None:
+    """Settle the Future of a request that has ended without any reply."""
+    if not future.done():
+        future.set_exception(UnavailableError(f"nobody serves topic {topic.name}, or its node died while it worked"))
