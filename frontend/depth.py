@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from seamark.frontend import flow, se3
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.epipolar import refine_along
 from seamark.frontend.features import grey_of
 from seamark.frontend.types import Frame, Mode, Rig
 
 EPIPOLAR_PX = 1.5
+MAX_REFINEMENT_PX = 2.5
+MIN_CORRELATION = 0.8
 EDGE_SPREAD = 0.05  # relative depth range in a 3x3 neighbourhood that marks a depth edge
 
 
@@ -76,7 +79,7 @@ class StereoPair:
         self._config = config
         self._baseline_m = float(np.linalg.norm(rig.T_cam0_cam1[:3, 3]))
         R, t = self._T_right_left[:3, :3], self._T_right_left[:3, 3]
-        self._fundamental = np.linalg.inv(self._right.K).T @ se3.hat(t) @ R @ np.linalg.inv(self._left.K)
+        self._essential = se3.hat(t) @ R
 
     def inverse_depth(self, frame: Frame, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Triangulate every point with its match in the right image; sigma from the disparity's."""
@@ -84,16 +87,19 @@ class StereoPair:
         if frame.image_right is None or len(points) == 0:
             return unknown, unknown.copy()
         left, right = grey_of(frame.image), grey_of(frame.image_right)
-        there, ok = self._match(left, right, np.asarray(points, np.float32))
-
-        ideal_left, ideal_right = self._left.undistort(points), self._right.undistort(there)
-        lines = np.column_stack([ideal_left, np.ones(len(points))]) @ self._fundamental.T
-        distance = np.abs((lines[:, :2] * ideal_right).sum(1) + lines[:, 2]) / np.hypot(lines[:, 0], lines[:, 1])
-        inverse, parallax_px = self._triangulate(points, there)
         c = self._config
-        with np.errstate(invalid="ignore"):
-            ok &= (distance < EPIPOLAR_PX) & (parallax_px > c.min_disparity_px) & (inverse > 0) & (inverse < 1 / c.depth_min_m)
+        there, ok = self._match(left, right, np.asarray(points, np.float32))
+        inverse, distance = self._triangulate(points, there)
+        ok &= (distance < EPIPOLAR_PX) & (inverse > 0) & (inverse < 1 / c.depth_min_m)
+
+        chosen = np.flatnonzero(ok)
+        on_curve, along = self._epipolar_curve(points[chosen], inverse[chosen])
+        refined, correlation = refine_along(left, right, points[chosen], on_curve, along)
+        inverse[chosen], distance = self._triangulate(points[chosen], refined)
+        stayed = np.linalg.norm(refined - on_curve, axis=1) < MAX_REFINEMENT_PX
         sigma = c.disparity_sigma_px / (self._left.fx * self._baseline_m)
+        ok[chosen] = stayed & (correlation > MIN_CORRELATION) & (distance < EPIPOLAR_PX)
+        ok &= inverse > c.min_disparity_px / c.disparity_sigma_px * sigma
         return np.where(ok, inverse, np.nan), np.where(ok, sigma, np.nan)
 
     def _match(
@@ -111,19 +117,30 @@ class StereoPair:
             ok[~ok] = ok_again
         return there, ok
 
-    def _triangulate(
-        self, points: NDArray[np.floating], there: NDArray[np.float32]
+    def _epipolar_curve(
+        self, points: NDArray[np.floating], inverse: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the inverse depth in the left camera (N,) and the parallax to infinity in pixels (N,)."""
+        """Return where points (N, 2) of that inverse depth are in the right image, and the curve's unit direction there."""
+        rays = self._left.rays(points)
+        here, beyond = (
+            self._right.project(rays @ self._T_right_left[:3, :3].T + self._T_right_left[:3, 3] * rho[:, None])
+            for rho in (inverse, inverse + 0.01 / self._baseline_m)
+        )
+        step = beyond - here
+        return here, step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12)
+
+    def _triangulate(
+        self, points: NDArray[np.floating], there: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the inverse depth in the left camera (N,) and the distance to the epipolar line in ideal pixels (N,)."""
         rays_left, rays_right = self._left.rays(points), self._right.rays(there)
         R, t = self._T_right_left[:3, :3], self._T_right_left[:3, 3]
-        turned = rays_left @ R.T
-        # z * turned + t lies on the right ray; the cross product with that ray leaves a + b / z = 0.
-        a, b = np.cross(rays_right, turned), np.cross(rays_right, t[None])
+        # z * (R ray_left) + t lies on the right ray; the cross product with that ray leaves a + b / z = 0.
+        a, b = np.cross(rays_right, rays_left @ R.T), np.cross(rays_right, t[None])
         inverse = -(a * b).sum(1) / np.maximum((b * b).sum(1), 1e-18)
-        at_infinity = turned[:, :2] / turned[:, 2:]
-        parallax = np.linalg.norm(rays_right[:, :2] - at_infinity, axis=1) * self._right.fx
-        return inverse, parallax
+        lines = rays_left @ self._essential.T
+        distance = np.abs((lines * rays_right).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
+        return inverse, distance * self._right.fx
 
 
 def make_depth_sensor(rig: Rig, mode: Mode, config: FrontendConfig) -> DepthSensor:
