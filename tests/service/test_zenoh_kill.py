@@ -49,7 +49,8 @@ def test_a_killed_reader_misses_nothing(tmp_path: Path) -> None:
         bus.close()
         watch.close()
     seen = [int(line) for line in log.read_text(encoding="utf-8").split()]
-    # A reader killed between its work and its acknowledgement is sent that one message again.
-    repeats = [n for n, before in zip(seen[1:], seen, strict=False) if n == before]
-    assert len(repeats) <= 2
-    assert sorted(set(seen)) == list(range(MESSAGES)) and seen == sorted(seen)
+    # Acknowledgements that were still inside the killed process are lost: at most a window is sent again, in order.
+    steps = [n - before for n, before in zip(seen[1:], seen, strict=False)]
+    back = [step for step in steps if step != 1]
+    assert len(back) <= 2 and all(-TOPIC.depth < step <= 0 for step in back)
+    assert seen[0] == 0 and seen[-1] == MESSAGES - 1 and set(seen) == set(range(MESSAGES))
