@@ -15,13 +15,14 @@ class Panel:
     """A rectangle with a picture, visible from its front only.
 
     ``corner`` (3,) is the top left corner as seen from the front; ``right`` and ``down`` (3,) are its edges in metres.
-    The BGR picture covers the whole rectangle.
+    The BGR picture covers the whole rectangle; ``glow`` adds light of its own (lamps).
     """
 
     corner: Vector
     right: Vector
     down: Vector
     image: Image
+    glow: float = 0.0
 
     @property
     def normal(self) -> Vector:

@@ -1,0 +1,71 @@
+"""A mild model of an RGB-D camera, and how its frames are coded on disk and between processes."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark import SeamarkError
+from seamark.datasets_synth.textures import Image, to_image
+from seamark.frontend.types import Frame
+
+DEPTH_FACTOR = 5000.0  # raw units per metre, as in the TUM RGB-D sets
+DEPTH_STEP_M = 0.001  # cheap depth cameras give whole millimetres
+DEPTH_RANGE_M = (0.3, 8.0)
+DEPTH_NOISE_PER_M = 0.001  # standard deviation = this times z squared: 1 mm at 1 m, 16 mm at 4 m
+IMAGE_NOISE_GREY = 2.0
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class CodedFrame:
+    """One frame as files: JPEG pictures and a PNG depth image, empty where the sensor is missing."""
+
+    index: int
+    left: bytes
+    right: bytes = b""
+    depth: bytes = b""
+
+
+def expose(colour: NDArray[np.float32], rng: np.random.Generator) -> Image:
+    """Return what the sensor reads of BGR light (H, W, 3) in 0..255: uint8 with noise."""
+    return to_image(colour + np.float32(IMAGE_NOISE_GREY) * rng.standard_normal(colour.shape, np.float32))
+
+
+def measure_depth(depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: noise growing with z squared, whole mm, 0 out of range."""
+    noisy = depth + np.float32(DEPTH_NOISE_PER_M) * depth**2 * rng.standard_normal(depth.shape, np.float32)
+    steps = np.rint(noisy / np.float32(DEPTH_STEP_M))
+    near, far = DEPTH_RANGE_M
+    raw = np.where((depth >= near) & (noisy >= near) & (noisy <= far), steps * (DEPTH_STEP_M * DEPTH_FACTOR), 0)
+    measured: NDArray[np.uint16] = np.rint(raw).astype(np.uint16)
+    return measured
+
+
+def code_picture(image: Image) -> bytes:
+    """Return the image as JPEG."""
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+
+
+def code_depth(raw: NDArray[np.uint16]) -> bytes:
+    """Return raw depth as 16 bit PNG, coded fast rather than small."""
+    return bytes(cv2.imencode(".png", raw, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+
+
+def decode(coded: CodedFrame, stamp_ns: int, file: str) -> Frame:
+    """Return the frame; raises SeamarkError where a file cannot be decoded."""
+
+    def pixels(blob: bytes, flags: int, what: str) -> NDArray[np.uint8]:
+        image = cv2.imdecode(np.frombuffer(blob, np.uint8), flags) if blob else None
+        if image is None:
+            raise SeamarkError(
+                f"the {what} of rendered frame {file} cannot be decoded; delete its folder to render again"
+            )
+        image.setflags(write=False)
+        return np.asarray(image)
+
+    left = pixels(coded.left, cv2.IMREAD_COLOR, "picture")
+    right = pixels(coded.right, cv2.IMREAD_COLOR, "right picture") if coded.right else None
+    depth = pixels(coded.depth, cv2.IMREAD_UNCHANGED, "depth").astype(np.uint16, copy=False) if coded.depth else None
+    return Frame(coded.index, stamp_ns, left, image_right=right, depth=depth, file=file)

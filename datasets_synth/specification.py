@@ -1,0 +1,122 @@
+"""Names of synthetic sequences: ``loop,frames=400,seed=3,sensors=rgbd`` and what they stand for."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark import SeamarkError
+from seamark.datasets_synth import sensor, world_loop
+from seamark.datasets_synth.world import World
+from seamark.frontend import se3
+from seamark.frontend.camera import Camera, Rig
+from seamark.frontend.types import Mode
+
+WORLDS = ("loop",)
+SIZES = tuple(world_loop.PLANS)
+IMAGES = {"640x480": (640, 480), "320x240": (320, 240)}
+SENSORS = (Mode.RGBD, Mode.STEREO, Mode.MONO)
+FRAMES = (2, 5000)
+FPS = 15.0
+FOCAL_PER_WIDTH = 0.640625  # 410 px at a width of 640: 76 degrees wide
+BASELINE_M = 0.12
+
+
+@dataclass(frozen=True)
+class Specification:
+    """One synthetic sequence, complete: the same specification gives the same bits on one machine."""
+
+    world: str
+    frames: int = 600
+    seed: int = 0
+    sensors: str = Mode.RGBD.value
+    size: str = "full"
+    image: str = "640x480"
+
+    @property
+    def mode(self) -> Mode:
+        """Return the richest mode that the sensors allow."""
+        return Mode(self.sensors)
+
+    @property
+    def rig(self) -> Rig:
+        """Return the calibration of the sensors."""
+        width, height = IMAGES[self.image]
+        focal = FOCAL_PER_WIDTH * width
+        camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        if self.mode is Mode.STEREO:
+            return Rig(camera, camera, se3.make(np.eye(3), np.array([BASELINE_M, 0, 0])))
+        return Rig(camera, depth_factor=sensor.DEPTH_FACTOR)
+
+    def build(self) -> World:
+        """Return the world."""
+        return world_loop.build_loop(world_loop.PLANS[self.size], self.seed)
+
+    def poses(self) -> NDArray[np.float64]:
+        """Return T_world_cam (N, 4, 4)."""
+        return world_loop.loop_poses(world_loop.PLANS[self.size], self.frames, self.seed)
+
+
+def _choice(options: tuple[str, ...]) -> Callable[[str, str], str]:
+    def parse(key: str, text: str) -> str:
+        if text not in options:
+            raise SeamarkError(f"synthetic sequences know no {key}={text}; there are {', '.join(options)}")
+        return text
+
+    return parse
+
+
+def _number(low: int, high: int) -> Callable[[str, str], int]:
+    def parse(key: str, text: str) -> int:
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise SeamarkError(f"{key} of a synthetic sequence is a whole number from {low} to {high}, not {text!r}")
+        return int(text)
+
+    return parse
+
+
+PARSERS: dict[str, Callable[[str, str], str | int]] = {
+    "frames": _number(*FRAMES),
+    "seed": _number(0, 2**31 - 1),
+    "sensors": _choice(tuple(mode.value for mode in SENSORS)),
+    "size": _choice(SIZES),
+    "image": _choice(tuple(IMAGES)),
+}
+
+
+def parse(text: str) -> Specification:
+    """Return the specification that ``WORLD[,key=value...]`` stands for; raises SeamarkError listing what exists."""
+    world, *settings = [part.strip() for part in text.split(",")]
+    if world not in WORLDS:
+        raise SeamarkError(f"there is no synthetic world {world!r}; there are {', '.join((*WORLDS, 'small_loop'))}")
+    values: dict[str, str | int] = {}
+    for setting in settings:
+        key, equals, value = (part.strip() for part in setting.partition("="))
+        if not equals or key not in PARSERS:
+            raise SeamarkError(f"synthetic world {world} has no setting {setting!r}; there are {', '.join(PARSERS)}")
+        if key in values:
+            raise SeamarkError(f"setting {key} of synthetic world {world} is given twice")
+        values[key] = PARSERS[key](key, value)
+    return Specification(world, **values)  # type: ignore[arg-type]
+
+
+def content_hash(specification: Specification) -> str:
+    """Return 16 hex digits that change with the specification, the code that renders, and the libraries' versions."""
+    try:
+        simulator = metadata.version("sapien")
+    except metadata.PackageNotFoundError:
+        simulator = "none"
+    digest = hashlib.sha256(json.dumps(asdict(specification), sort_keys=True).encode())
+    digest.update(f"sapien {simulator} numpy {np.__version__} cv2 {cv2.__version__}".encode())
+    for name in (
+        *("textures", "prints", "panels", "trajectory", "world", "floor_plan", "world_loop"),
+        *("renderer", "sensor", "specification", "worker", "folder"),
+    ):
+        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
+    return digest.hexdigest()[:16]

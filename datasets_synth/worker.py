@@ -1,0 +1,73 @@
+"""The child process that renders: ``python -m seamark.datasets_synth.worker``; nothing else ever loads SAPIEN.
+
+It reads one JSON line from standard input (``probe``, or a specification with the first index and the step) and writes
+frames as headers and blobs to standard output. Standard input stays open as a life line: when the parent goes, so does
+the child.
+"""
+
+import json
+import os
+import struct
+import sys
+import threading
+from typing import Any, BinaryIO
+
+HEADER = struct.Struct("<iIII")  # index, bytes of the left picture, the right picture, the depth image
+
+
+def _die_with_parent() -> None:
+    """End the process when standard input closes."""
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def _private_output() -> BinaryIO:
+    """Return the pipe to the parent, and let everything that libraries print go to standard error."""
+    pipe = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return pipe
+
+
+def _render(job: dict[str, Any], output: BinaryIO) -> None:
+    import cv2
+    import numpy as np
+
+    from seamark.datasets_synth import sensor
+    from seamark.datasets_synth.renderer import Renderer
+    from seamark.datasets_synth.specification import Specification
+    from seamark.frontend.types import Mode
+
+    cv2.setNumThreads(1)
+    specification = Specification(**job["specification"])
+    poses = specification.poses()
+    renderer = Renderer(specification.build(), specification.rig)
+    for index in range(job["first"], specification.frames, job["step"]):
+        colour, depth, right_colour = renderer.render(poses[index])
+        rng = np.random.default_rng([specification.seed, index, 0x5E])
+        left = sensor.code_picture(sensor.expose(colour, rng))
+        right = b"" if right_colour is None else sensor.code_picture(sensor.expose(right_colour, rng))
+        raw = sensor.code_depth(sensor.measure_depth(depth, rng)) if specification.mode is Mode.RGBD else b""
+        output.write(HEADER.pack(index, len(left), len(right), len(raw)))
+        for blob in (left, right, raw):
+            output.write(blob)
+        output.flush()
+
+
+def main() -> None:
+    """Do the job that standard input names, then exit."""
+    output = _private_output()
+    job = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    if job.get("probe"):
+        from seamark.datasets_synth.renderer import devices
+
+        output.write(devices().encode())
+    else:
+        _render(job, output)
+    output.close()
+    sys.stderr.flush()
+    os._exit(0)  # drivers have been seen to hang in their exit handlers
+
+
+if __name__ == "__main__":
+    main()

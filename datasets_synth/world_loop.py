@@ -1,0 +1,134 @@
+"""The world ``loop``: four rooms at the corners of a ring of four corridors, and one lap through them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.datasets_synth import floor_plan
+from seamark.datasets_synth.floor_plan import Space
+from seamark.datasets_synth.trajectory import look
+from seamark.datasets_synth.world import World
+
+EYE_HEIGHT_M = 1.3
+STEP_M = 0.01  # of the path before it is resampled
+
+
+@dataclass(frozen=True)
+class LoopPlan:
+    """The measures of a lap: half the distances of the room centres, sizes of rooms and corridors, how it is walked.
+
+    ``rounding_m`` is the sigma of the Gaussian that rounds the corners; ``turn_cost_m`` says how many metres of walking
+    one radian of turning costs, so that turns are slow; ``start_m`` and ``overlap_m`` are along the lap.
+    """
+
+    half_x: float
+    half_y: float
+    room_sizes: tuple[tuple[float, float], ...]
+    corridor_widths: tuple[float, ...]
+    heights: tuple[float, float]
+    rounding_m: float
+    turn_cost_m: float
+    start_m: float
+    overlap_m: float
+    boxes_per_room: int
+
+
+FULL = LoopPlan(
+    half_x=10.5,
+    half_y=6.2,
+    room_sizes=((6.4, 5.6), (5.6, 6.6), (7.0, 5.6), (6.0, 6.2)),
+    corridor_widths=(2.6, 2.3, 3.4, 2.5),
+    heights=(2.9, 2.4),
+    rounding_m=1.5,
+    turn_cost_m=2.0,
+    start_m=2.3,
+    overlap_m=4.0,
+    boxes_per_room=7,
+)
+SMALL = LoopPlan(
+    half_x=3.1,
+    half_y=2.3,
+    room_sizes=((3.6, 3.2), (3.4, 3.4), (3.8, 3.2), (3.4, 3.2)),
+    corridor_widths=(2.0, 1.9, 2.2, 1.9),
+    heights=(2.6, 2.3),
+    rounding_m=0.8,
+    turn_cost_m=2.6,
+    start_m=1.0,
+    overlap_m=2.2,
+    boxes_per_room=3,
+)
+PLANS = {"full": FULL, "small": SMALL}
+
+
+def spaces(plan: LoopPlan) -> list[Space]:
+    """Return the four rooms, then the four corridors, anticlockwise from the south-west."""
+    corners = [(-plan.half_x, -plan.half_y), (plan.half_x, -plan.half_y), (plan.half_x, plan.half_y)]
+    corners.append((-plan.half_x, plan.half_y))
+    rooms = [
+        Space.about(*corner, *size, plan.heights[0]) for corner, size in zip(corners, plan.room_sizes, strict=True)
+    ]
+    south_west, south_east, north_east, north_west = rooms
+    half = [width / 2 for width in plan.corridor_widths]
+    y, x = plan.half_y, plan.half_x
+    corridors = [
+        Space(south_west.east, south_east.west, -y - half[0], -y + half[0], plan.heights[1]),
+        Space(x - half[1], x + half[1], south_east.north, north_east.south, plan.heights[1]),
+        Space(north_west.east, north_east.west, y - half[2], y + half[2], plan.heights[1]),
+        Space(-x - half[3], -x + half[3], south_west.north, north_west.south, plan.heights[1]),
+    ]
+    return rooms + corridors
+
+
+def lap(plan: LoopPlan) -> NDArray[np.float64]:
+    """Return one closed lap (N, 2) in steps of at most STEP_M, anticlockwise, corners rounded."""
+    x, y = plan.half_x, plan.half_y
+    corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]])
+    distances = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    s = np.arange(0, distances[-1], STEP_M)
+    path = np.stack([np.interp(s, distances, corners[:, axis]) for axis in range(2)], axis=1)
+    reach = int(5 * plan.rounding_m / STEP_M)
+    padded = np.concatenate([path[-reach:], path, path[:reach]])
+    kernel = cv2.getGaussianKernel(2 * reach + 1, plan.rounding_m / STEP_M).ravel()
+    return np.stack([np.convolve(padded[:, axis], kernel, "valid") for axis in range(2)], axis=1)
+
+
+def loop_poses(plan: LoopPlan, n_frames: int, seed: int) -> NDArray[np.float64]:
+    """Return T_world_cam (N, 4, 4): a lap and ``overlap_m`` more, slow in turns, with the sway of a walking robot."""
+    rng = np.random.default_rng([seed, 0x9A7])
+    once = lap(plan)
+    first, more = (int(length / STEP_M) for length in (plan.start_m, plan.overlap_m))
+    path = np.roll(once, -first, axis=0)
+    path = np.concatenate([path, path[: more + 1]])
+    steps = np.diff(path, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    effort = np.concatenate([[0], np.cumsum(lengths[1:] + plan.turn_cost_m * np.abs(np.diff(headings)))])
+    at = np.interp(np.linspace(0, effort[-1], n_frames), effort, np.arange(len(effort), dtype=np.float64))
+    place = np.stack([np.interp(at, np.arange(len(path)), path[:, axis]) for axis in range(2)], axis=1)
+    heading = np.interp(at, np.arange(len(headings)), headings)
+    travelled = np.interp(at, np.arange(len(path)), np.concatenate([[0], np.cumsum(lengths)]))
+    phases = rng.uniform(0, 2 * np.pi, 6)
+    waves = np.sin(2 * np.pi * travelled[:, None] / np.array([7.3, 5.9, 4.7, 6.7, 8.9, 3.7]) + phases)
+    amplitudes = np.array([0.05, 0.02, np.deg2rad(2.5), np.deg2rad(1.5), np.deg2rad(1.0), 0.01])
+    side, lift, yaw, pitch, roll, bob = (waves * amplitudes).T
+    aside = np.stack([-np.sin(heading), np.cos(heading)], axis=1) * side[:, None]
+    position = np.column_stack([place + aside, EYE_HEIGHT_M + lift + bob])
+    return np.stack([look(*sample) for sample in zip(position, heading + yaw, pitch, roll, strict=True)])
+
+
+def build_loop(plan: LoopPlan, seed: int) -> World:
+    """Return the panels and lamps of the world; everything in it is drawn from ``seed``."""
+    places, path = spaces(plan), lap(plan)[::10]
+    panels, lamps = [], []
+    for number, space in enumerate(places):
+        rng = np.random.default_rng([seed, number, 0x100F])
+        others = [other for other in places if other is not space]
+        panels += floor_plan.walls(rng, space, others)
+        panels += floor_plan.floor_and_ceiling(rng, space)
+        panels += floor_plan.furniture(rng, space, path, plan.boxes_per_room)
+        glowing, lights = floor_plan.lamps(rng, space)
+        panels += glowing
+        lamps += lights
+    return World(tuple(panels), tuple(lamps), (0.5, 0.5, 0.52))
