@@ -1,0 +1,141 @@
+"""Settings of the back end; units are in the names, the defaults work."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class VerificationConfig(_Section):
+    """How two views are compared by geometry."""
+
+    candidates: int = Field(default=5, ge=1, description="how many islands of candidates are verified per keyframe")
+    island_keyframes: int = Field(
+        default=3, ge=0, description="candidates this near to a verified one are not verified again"
+    )
+    min_gap_keyframes: int = Field(default=5, ge=1, description="candidates nearer in the same session are no loops")
+    match_ratio: float = Field(default=0.85, gt=0, le=1, description="best over second-best descriptor distance")
+    min_matches: int = Field(default=15, ge=8, description="descriptor matches below which geometry is not tried")
+    reprojection_px: float = Field(default=3.0, gt=0, description="largest reprojection error of an inlier of a pose")
+    epipolar_px: float = Field(default=1.5, gt=0, description="largest distance from the epipolar line")
+    confidence: float = Field(default=0.9999, gt=0, lt=1, description="confidence at which sampling stops")
+    iterations: int = Field(default=5000, ge=100, description="most samples drawn")
+    min_inliers: int = Field(default=15, ge=6, description="inliers of a pose below which it is refused")
+    min_inlier_ratio: float = Field(default=0.15, ge=0, le=1, description="inliers of a pose per match with depth")
+    min_epipolar_inliers: int = Field(
+        default=20, ge=9, description="inliers of epipolar geometry below which it is refused"
+    )
+    min_epipolar_ratio: float = Field(default=0.35, ge=0, le=1, description="inliers of epipolar geometry per match")
+    min_hull_fraction: float = Field(
+        default=0.015, ge=0, le=1, description="area of the inliers' hull per area of the image"
+    )
+    min_cells: int = Field(
+        default=4, ge=1, description="cells of an 8 x 6 grid over the image that inliers must occupy"
+    )
+    noise_px: float = Field(
+        default=1.0, gt=0, description="least standard deviation of a key point assumed for covariances"
+    )
+    covariance_inflation: float = Field(
+        default=4.0, ge=1, description="factor on a pose's covariance: landmarks err too"
+    )
+    rotation_floor_deg: float = Field(default=0.1, gt=0, description="least standard deviation of a loop's rotation")
+    translation_floor_fraction: float = Field(
+        default=0.01, gt=0, description="least standard deviation of a loop's translation per median depth"
+    )
+    min_scale_pairs: int = Field(
+        default=10, ge=3, description="inliers with depth in both views needed for a loop's scale"
+    )
+
+
+class DriftConfig(_Section):
+    """How far odometry may be wrong beyond its covariance.
+
+    Visual odometry errs by a slowly varying bias and not by white noise: over a long way the error grows with the
+    length and not with its root. Gates take the bias as it is; the graph, which knows white noise only, takes what
+    gives the same error over ``horizon_keyframes``.
+    """
+
+    covariance_inflation: float = Field(default=4.0, ge=1, description="factor on the odometry's covariances")
+    translation_fraction: float = Field(
+        default=0.01, ge=0, description="standard deviation of the bias per length of way"
+    )
+    mono_translation_fraction: float = Field(default=0.05, ge=0, description="the same where scale may drift too")
+    rotation_fraction: float = Field(default=0.01, ge=0, description="standard deviation of the bias per angle turned")
+    rotation_deg_per_keyframe: float = Field(
+        default=0.05, ge=0, description="standard deviation of the bias per keyframe"
+    )
+    scale_per_keyframe: float = Field(
+        default=0.02, gt=0, description="mono: standard deviation of log scale per root keyframe"
+    )
+    horizon_keyframes: int = Field(
+        default=100, ge=1, description="keyframes over which white noise shall equal the bias"
+    )
+    floor_rotation_deg: float = Field(
+        default=0.02, gt=0, description="least standard deviation of one motion's rotation"
+    )
+    floor_translation_m: float = Field(
+        default=0.001, gt=0, description="least standard deviation of one motion's translation"
+    )
+
+
+class ConsistencyConfig(_Section):
+    """When loops count as supporting or contradicting odometry and each other."""
+
+    gate_chi2: float = Field(
+        default=22.46, gt=0, description="largest chi squared of a loop against odometry (6 dof, 99.9 %)"
+    )
+    pair_chi2: float = Field(
+        default=16.81, gt=0, description="largest chi squared of a cycle of two loops (6 dof, 99 %)"
+    )
+    strong_inliers: int = Field(
+        default=60, ge=6, description="inliers that accept a loop that nothing contradicts alone"
+    )
+    support_keyframes: int = Field(
+        default=10, ge=1, description="loops whose ends are this near to each other can confirm"
+    )
+    min_support: int = Field(
+        default=1, ge=1, description="consistent neighbouring loops of other keyframes that confirm one"
+    )
+    compared_loops: int = Field(
+        default=100, ge=2, description="nearest loops of the same sessions that one is compared with"
+    )
+    clique_starts: int = Field(default=20, ge=1, description="starts of the greedy clique search")
+
+
+class GraphConfig(_Section):
+    """The pose graph and its solver."""
+
+    cauchy_width: float = Field(
+        default=2.0, gt=0, description="width of the robust kernel of loops in standard deviations"
+    )
+    prior_sigma: float = Field(default=1e-3, ge=1e-4, description="standard deviation of the first pose (rad, m)")
+    relinearise_threshold: float = Field(
+        default=0.01, gt=0, description="change (rad, m) from which iSAM2 relinearises"
+    )
+    incremental_updates: int = Field(default=5, ge=1, description="most iSAM2 iterations after a loop")
+    batch_iterations: int = Field(default=50, ge=1, description="most Levenberg-Marquardt iterations")
+    unknown_scale_sigma: float = Field(
+        default=0.05, gt=0, description="log scale deviation of a mono loop read from disk"
+    )
+
+
+class PlacesConfig(_Section):
+    """Mode places: when a recognised place counts without poses."""
+
+    strong_inliers: int = Field(default=60, ge=9, description="inliers that accept a place alone")
+    window_queries: int = Field(default=3, ge=1, description="how many images back or ahead can confirm a place")
+    slack_images: int = Field(
+        default=3, ge=0, description="how far matches may deviate from moving along with the queries"
+    )
+    min_support: int = Field(default=1, ge=1, description="neighbouring queries with matching places that confirm one")
+
+
+class BackendConfig(_Section):
+    """All settings of the back end."""
+
+    verification: VerificationConfig = VerificationConfig()
+    drift: DriftConfig = DriftConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    graph: GraphConfig = GraphConfig()
+    places: PlacesConfig = PlacesConfig()

@@ -1,0 +1,106 @@
+"""What the pose graph takes and gives, and what its two solvers have in common; free of GTSAM."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.backend.errors import BackendInputError
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """A keyframe as the graph sees it.
+
+    ``T_odom_cam`` (4, 4) is its odometry pose, ``covariance`` (6, 6) that of the motion since the previous keyframe.
+    ``previous_id`` None starts a session. ``metric`` False: the session's scale is arbitrary and may drift.
+    """
+
+    id: int
+    session: int
+    previous_id: int | None
+    T_odom_cam: Matrix
+    covariance: Matrix
+    metric: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """A loop as the graph sees it.
+
+    ``T_match_query`` (4, 4) has its translation in the match's units, ``scale`` is match units per query unit,
+    ``covariance`` (6, 6) is in the query's frame, rotation first, ``scale_sigma`` of log scale.
+    """
+
+    query_id: int
+    match_id: int
+    T_match_query: Matrix
+    covariance: Matrix
+    scale: float = 1.0
+    scale_sigma: float = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """All poses of the graph at one revision; arrays as in :class:`~seamark.backend.types.MapSnapshot`."""
+
+    revision: int
+    keyframe_ids: NDArray[np.int64]
+    components: NDArray[np.int64]
+    T_map_cam: Matrix
+    scales: NDArray[np.float64]
+
+
+class Solver(Protocol):
+    """What :class:`PoseGraph` (here) and :class:`SolverProcess` (in a child process) both offer."""
+
+    def add_keyframe(self, node: Node) -> None:
+        """Append a keyframe; raises BackendInputError when it is malformed."""
+
+    def add_loop(self, constraint: Constraint) -> None:
+        """Commit a loop; it acts at the next ``optimise``."""
+
+    def remove_loop(self, query_id: int, match_id: int) -> None:
+        """Withdraw a loop; it ceases to act at the next ``optimise``."""
+
+    def optimise(self, thorough: bool = False) -> Estimate:
+        """Return the poses with all loops so far; ``thorough`` iterates from scratch to convergence."""
+
+    def close(self) -> None:
+        """Release what the solver holds."""
+
+
+def check_node(node: Node) -> None:
+    """Raise BackendInputError unless the node's numbers are finite and its pose is rigid.
+
+    A NaN would spread through the whole solution without a word (Levenberg-Marquardt returns it silently).
+    """
+    _check_pose(f"keyframe {node.id}", node.T_odom_cam)
+    _check_covariance(f"keyframe {node.id}", node.covariance)
+
+
+def check_constraint(constraint: Constraint) -> None:
+    """Raise BackendInputError unless the loop's numbers are finite, its pose rigid and its scale positive."""
+    name = f"loop {constraint.query_id} to {constraint.match_id}"
+    _check_pose(name, constraint.T_match_query)
+    _check_covariance(name, constraint.covariance)
+    numbers = (constraint.scale, constraint.scale_sigma)
+    if not all(np.isfinite(numbers)) or min(numbers) <= 0:
+        raise BackendInputError(f"{name} has scale {constraint.scale} +- {constraint.scale_sigma}")
+    if constraint.query_id == constraint.match_id:
+        raise BackendInputError(f"{name} joins a keyframe with itself")
+
+
+def _check_pose(name: str, T: Matrix) -> None:
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise BackendInputError(f"{name} has a pose that is no finite 4 x 4 matrix: {T.tolist()}")
+    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
+        raise BackendInputError(f"{name} has a pose whose rotation is none: {T[:3, :3].tolist()}")
+
+
+def _check_covariance(name: str, covariance: Matrix) -> None:
+    if covariance.shape != (6, 6) or not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
+        raise BackendInputError(f"{name} has a covariance that is none: {covariance.tolist()}")
