@@ -20,8 +20,8 @@ class CalibrationError(SeamarkError):
 class Camera:
     """A pinhole camera with OpenCV's radial-tangential distortion.
 
-    ``fx fy cx cy`` are pixels for an image of ``width`` x ``height``; ``distortion`` has 0, 4, 5 or 8 numbers in OpenCV's
-    order (k1 k2 p1 p2 k3 k4 k5 k6). Raises CalibrationError for anything else.
+    ``fx fy cx cy`` are pixels for an image of ``width`` x ``height``; ``distortion`` has 0, 4, 5 or 8 numbers in
+    OpenCV's order (k1 k2 p1 p2 k3 k4 k5 k6). Raises CalibrationError for anything else.
     """
 
     width: int

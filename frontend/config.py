@@ -35,7 +35,9 @@ class FrontendConfig(BaseModel):
 
     # Keyframes and the local window
     keyframe_max_gap_s: float = Field(2.0, gt=0, description="a keyframe at least this often while the camera moves")
-    keyframe_parallax_px: float = Field(35.0, gt=0, description="median parallax, rotation taken out, of a new keyframe")
+    keyframe_parallax_px: float = Field(
+        35.0, gt=0, description="median parallax, rotation taken out, of a new keyframe"
+    )
     keyframe_rotation_deg: float = Field(15.0, gt=0)
     keyframe_tracked_ratio: float = Field(0.6, gt=0, lt=1, description="share of the keyframe's landmarks still seen")
     window_keyframes: int = Field(8, ge=3, le=30)
@@ -52,6 +54,6 @@ class FrontendConfig(BaseModel):
 
     # What a keyframe carries
     sift_features: int = Field(1000, ge=100, le=10000)
-    sift_contrast: float = Field(0.03, gt=0, lt=1)
+    sift_contrast: float = Field(0.015, gt=0, lt=1)
     jpeg_quality: int = Field(85, ge=30, le=100)
     thumbnail_px: int = Field(96, ge=16, le=640, description="longer side of the copy for colour histograms")

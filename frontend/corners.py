@@ -46,9 +46,9 @@ def detect_corners(
     response[:, :BORDER_PX] = response[:, -BORDER_PX:] = 0
 
     cells = response[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).swapaxes(1, 2)
-    cells = cells.reshape(rows * columns, cell * cell)
-    best = cells.argmax(axis=1)
-    strength = cells[np.arange(len(cells)), best]
+    flat = cells.reshape(rows * columns, cell * cell)
+    best = flat.argmax(axis=1)
+    strength = flat[np.arange(len(flat)), best]
     floor = max(min_response**2 if harris else min_response, RELATIVE_RESPONSE * float(np.quantile(strength, 0.95)))
     wanted = strength > floor
 

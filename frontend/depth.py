@@ -4,6 +4,7 @@ Every sensor answers with the inverse depth (1/m) of points and its standard dev
 inverse depth is what both a disparity and a triangulation measure, and its noise stays Gaussian at long range.
 """
 
+import warnings
 from typing import Protocol
 
 import numpy as np
@@ -18,13 +19,16 @@ from seamark.frontend.types import Frame, Mode, Rig
 EPIPOLAR_PX = 1.5
 MAX_REFINEMENT_PX = 2.5
 MIN_CORRELATION = 0.8
+MIN_READINGS = 3  # of 9: registered depth images are full of single-pixel holes
 EDGE_SPREAD = 0.05  # relative depth range in a 3x3 neighbourhood that marks a depth edge
 
 
 class DepthSensor(Protocol):
     """Gives inverse depths of pixels of ``Frame.image``."""
 
-    def inverse_depth(self, frame: Frame, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def inverse_depth(
+        self, frame: Frame, points: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return inverse depth and its sigma, each (N,) in 1/m, NaN where unknown, for pixels (N, 2) as seen."""
         ...
 
@@ -32,19 +36,23 @@ class DepthSensor(Protocol):
 class NoDepth:
     """Mono: depth comes from motion only."""
 
-    def inverse_depth(self, frame: Frame, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def inverse_depth(
+        self, frame: Frame, points: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return all unknown."""
         return np.full(len(points), np.nan), np.full(len(points), np.nan)
 
 
 class DepthImage:
-    """RGB-D: the registered depth image, read at the nearest pixel, without points on depth edges."""
+    """RGB-D: the registered depth image, the median of 3x3 pixels, without points on depth edges."""
 
     def __init__(self, rig: Rig, config: FrontendConfig) -> None:
         self._depth_factor = rig.depth_factor
         self._config = config
 
-    def inverse_depth(self, frame: Frame, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def inverse_depth(
+        self, frame: Frame, points: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return inverse depth and sigma after the sensor's noise model (sigma_z = floor + c z^2, Khoshelham 2012)."""
         unknown = np.full(len(points), np.nan)
         if frame.depth is None or len(points) == 0:
@@ -57,12 +65,13 @@ class DepthImage:
         if depth.dtype == np.uint16:
             around /= self._depth_factor
         around[~np.isfinite(around) | (around <= 0)] = np.nan
-        z = around[4]
         c = self._config
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # points without any reading around them are expected
+            z = np.nanmedian(around, axis=0)
+            spread = np.nanmax(around, axis=0) - np.nanmin(around, axis=0)
         with np.errstate(invalid="ignore"):
-            valid = (z > c.depth_min_m) & (z < c.depth_max_m)
-            known = np.where(np.isnan(around), z, around)
-            spread = known.max(axis=0) - known.min(axis=0)
+            valid = (z > c.depth_min_m) & (z < c.depth_max_m) & (np.isfinite(around).sum(axis=0) >= MIN_READINGS)
             valid &= spread < np.maximum(EDGE_SPREAD * z, 4 * (c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2))
         z = np.where(valid, z, np.nan)
         sigma_z = c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2
@@ -81,7 +90,9 @@ class StereoPair:
         R, t = self._T_right_left[:3, :3], self._T_right_left[:3, 3]
         self._essential = se3.hat(t) @ R
 
-    def inverse_depth(self, frame: Frame, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def inverse_depth(
+        self, frame: Frame, points: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Triangulate every point with its match in the right image; sigma from the disparity's."""
         unknown = np.full(len(points), np.nan)
         if frame.image_right is None or len(points) == 0:
@@ -107,7 +118,9 @@ class StereoPair:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Match along coarse-to-fine flow, from infinity and, where that fails, from a close guess."""
         rays = self._left.rays(points)
-        guesses = [self._right.project(se3.transform(self._T_right_left, rays * z)) for z in (1e6, 25 * self._baseline_m)]
+        guesses = [
+            self._right.project(se3.transform(self._T_right_left, rays * z)) for z in (1e6, 25 * self._baseline_m)
+        ]
         settings = {"window_px": 21, "levels": 4, "round_trip_px": self._config.flow_round_trip_px}
         there, ok = flow.track(left, right, points, guesses[0].astype(np.float32), **settings)  # type: ignore[arg-type]
         if not ok.all():
@@ -120,7 +133,9 @@ class StereoPair:
     def _epipolar_curve(
         self, points: NDArray[np.floating], inverse: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where points (N, 2) of that inverse depth are in the right image, and the curve's unit direction there."""
+        """Return where points (N, 2) of that inverse depth are in the right image, and the curve's unit direction
+        there.
+        """
         rays = self._left.rays(points)
         here, beyond = (
             self._right.project(rays @ self._T_right_left[:3, :3].T + self._T_right_left[:3, 3] * rho[:, None])
@@ -132,7 +147,9 @@ class StereoPair:
     def _triangulate(
         self, points: NDArray[np.floating], there: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the inverse depth in the left camera (N,) and the distance to the epipolar line in ideal pixels (N,)."""
+        """Return the inverse depth in the left camera (N,) and the distance to the epipolar line in ideal pixels
+        (N,).
+        """
         rays_left, rays_right = self._left.rays(points), self._right.rays(there)
         R, t = self._T_right_left[:3, :3], self._T_right_left[:3, 3]
         # z * (R ray_left) + t lies on the right ray; the cross product with that ray leaves a + b / z = 0.
@@ -150,4 +167,3 @@ def make_depth_sensor(rig: Rig, mode: Mode, config: FrontendConfig) -> DepthSens
     if mode is Mode.STEREO:
         return StereoPair(rig, config)
     return NoDepth()
-

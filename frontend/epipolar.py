@@ -1,7 +1,8 @@
 """Sub-pixel matching along a known line: Lucas-Kanade with one degree of freedom.
 
-Plain flow slides along edges that are slanted to the epipolar line, and what it slides off the line biases the disparity
-(0.1 px in the mean on driving images, one per cent of the scale). With the line given, the remaining unknown is well posed.
+Plain flow slides along edges that are slanted to the epipolar line, and what it slides off the line biases the
+disparity (0.1 px in the mean on driving images, one per cent of the scale). With the line given, the remaining
+unknown is well posed.
 """
 
 import cv2
@@ -22,7 +23,8 @@ def refine_along(
     start: NDArray[np.floating],
     directions: NDArray[np.floating],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Move ``start`` (N, 2) in the right image along unit ``directions`` (N, 2) until its patch looks like the left one's.
+    """Move ``start`` (N, 2) in the right image along unit ``directions`` (N, 2) until its patch looks like the left
+    one's.
 
     Patches are compared after their means are taken off (Baker and Matthews 2004, with a bias term). Returns the points
     (N, 2) float32 and the zero-mean normalised correlation (N,) float32 at the end, in -1..1.

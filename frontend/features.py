@@ -15,16 +15,16 @@ def grey_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Map SIFT descriptors (N, 128) to RootSIFT in uint8: Euclidean distance becomes Hellinger's (Arandjelovic 2012)."""
+    """Map SIFT descriptors (N, 128) to RootSIFT in uint8: Euclidean distance becomes Hellinger's (Arandjelovic
+    2012).
+    """
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
     return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(descriptors / total)), 255).astype(np.uint8)
 
 
-def extract_features(image: NDArray[np.uint8], n_features: int, contrast: float = 0.03) -> Features:
+def extract_features(image: NDArray[np.uint8], n_features: int, contrast: float = 0.015) -> Features:
     """Find at most ``n_features`` SIFT key points (Lowe 2004) in a grey or BGR uint8 image, strongest first."""
-    sift = cv2.SIFT_create(
-        nfeatures=n_features, contrastThreshold=contrast, enable_precise_upscale=True
-    )
+    sift = cv2.SIFT_create(nfeatures=n_features, contrastThreshold=contrast, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey_of(image), None)
     if descriptors is None or len(keypoints) == 0:
         return Features.empty()
@@ -39,9 +39,7 @@ def extract_features(image: NDArray[np.uint8], n_features: int, contrast: float 
     )
 
 
-def match_descriptors(
-    a: NDArray[np.uint8], b: NDArray[np.uint8], *, ratio: float = 0.8
-) -> NDArray[np.int64]:
+def match_descriptors(a: NDArray[np.uint8], b: NDArray[np.uint8], *, ratio: float = 0.8) -> NDArray[np.int64]:
     """Match descriptors (N, 128) and (M, 128): index pairs (K, 2) that pass the ratio test both ways and agree."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)

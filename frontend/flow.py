@@ -26,32 +26,32 @@ def track(
     if len(points) == 0:
         return np.zeros((0, 2), np.float32), np.zeros(0, bool)
     height, width = after.shape
-    settings = {"winSize": (window_px, window_px), "maxLevel": levels, "criteria": CRITERIA}
     start = np.ascontiguousarray(points, np.float32)
-    if guess is None:
-        there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, minEigThreshold=MIN_EIGENVALUE, **settings)
-    else:
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            before,
-            after,
-            start,
-            np.ascontiguousarray(guess, np.float32).copy(),
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=MIN_EIGENVALUE,
-            **settings,
-        )
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        after,
-        before,
-        there,
-        start.copy(),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=MIN_EIGENVALUE,
-        winSize=(window_px, window_px),
-        maxLevel=min(1, levels),
-        criteria=CRITERIA,
-    )
+    first = start if guess is None else np.ascontiguousarray(guess, np.float32)
+    there, found = _flow(before, after, start, first, window_px, levels)
+    back, found_back = _flow(after, before, there, start, window_px, min(1, levels))
     inside = (there[:, 0] >= 0) & (there[:, 1] >= 0) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     closed = np.linalg.norm(back - start, axis=1) < round_trip_px
-    ok = found.reshape(-1).astype(bool) & found_back.reshape(-1).astype(bool) & inside & closed
-    return there, ok
+    return there, found & found_back & inside & closed
+
+
+def _flow(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    guess: NDArray[np.float32],
+    window_px: int,
+    levels: int,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        points,
+        guess.copy(),  # OpenCV writes the result here
+        winSize=(window_px, window_px),
+        maxLevel=levels,
+        criteria=CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=MIN_EIGENVALUE,
+    )
+    return there, found.reshape(-1).astype(bool)

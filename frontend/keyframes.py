@@ -1,7 +1,8 @@
 """What a keyframe carries beyond its pose: SIFT, landmarks, JPEG, thumbnail; made in a thread beside tracking.
 
-SIFT costs as much as ten frames of tracking and OpenCV frees the interpreter while it works, so one plain thread keeps it
-off the frame's latency. Keyframes come out in the order they went in; nothing that the tracker decides depends on when.
+SIFT costs as much as ten frames of tracking and OpenCV frees the interpreter while it works, so one plain thread
+keeps it off the frame's latency. Keyframes come out in the order they went in; nothing that the tracker decides
+depends on when.
 """
 
 from collections import deque
@@ -17,8 +18,8 @@ from seamark.frontend import se3
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import DepthSensor
 from seamark.frontend.features import extract_features, match_descriptors, thumbnail_of
-from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 from seamark.frontend.two_view import triangulate
+from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
 TRIANGULATION_PX = 2.0
 RELATIVE_SIGMA = 0.2  # a landmark whose depth is less sure than this is not worth keeping
@@ -43,40 +44,53 @@ class KeyframeBuilder:
         self._rig, self._mode, self._config, self._sensor = rig, mode, config, sensor
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self._pending: deque[Future[list[Keyframe]]] = deque()
+        self._ready: list[Keyframe] = []
         self._recent: deque[Keyframe] = deque(maxlen=config.recovery_keyframes)
+        self.next_id = 0
         self._last_made: Keyframe | None = None  # touched by the pool's thread only
+
+    def request(
+        self,
+        frame: Frame,
+        session: int,
+        previous_id: int | None = None,
+        T_odom_cam: NDArray[np.float64] | None = None,
+        covariance: NDArray[np.float64] | None = None,
+    ) -> KeyframeRequest:
+        """Number a decided keyframe; it is made once it is submitted."""
+        request = KeyframeRequest(frame, self.next_id, session, previous_id, T_odom_cam, covariance)
+        self.next_id += 1
+        return request
 
     def submit(self, requests: Sequence[KeyframeRequest]) -> None:
         """Queue requests that belong together: two for the first map of a mono session, else one."""
         self._pending.append(self._pool.submit(self._make_all, list(requests)))
 
-    def finished(self) -> list[Keyframe]:
-        """Return the keyframes that are ready, without waiting."""
-        out: list[Keyframe] = []
+    def take(self) -> tuple[Keyframe, ...]:
+        """Hand out the keyframes that are ready, without waiting."""
         while self._pending and self._pending[0].done():
-            out += self._take()
-        return out
+            self._collect()
+        ready, self._ready = tuple(self._ready), []
+        return ready
 
-    def wait(self) -> list[Keyframe]:
-        """Return all keyframes that were submitted, waiting for them."""
-        out: list[Keyframe] = []
+    def wait(self) -> None:
+        """Wait until every submitted keyframe is ready."""
         while self._pending:
-            out += self._take()
-        return out
+            self._collect()
 
-    @property
-    def recent(self) -> list[Keyframe]:
-        """Return the last keyframes handed out, newest first."""
-        return list(reversed(self._recent))
+    def recent(self, session: int) -> list[Keyframe]:
+        """Wait, then return the last keyframes of a session, newest first."""
+        self.wait()
+        return [k for k in reversed(self._recent) if k.session == session]
 
     def close(self) -> None:
         """Stop the thread."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def _take(self) -> list[Keyframe]:
+    def _collect(self) -> None:
         keyframes = self._pending.popleft().result()
         self._recent.extend(keyframes)
-        return keyframes
+        self._ready.extend(keyframes)
 
     def _make_all(self, requests: list[KeyframeRequest]) -> list[Keyframe]:
         made: list[Keyframe] = []

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
-from seamark.frontend.pose import Observations, estimate_pose
-from seamark.frontend.session import Tracks
+from seamark.frontend.keyframes import KeyframeBuilder
+from seamark.frontend.pose import estimate_pose, motion_covariance
+from seamark.frontend.session import Session, Tracks
 from seamark.frontend.two_view import TwoView, initialise
 from seamark.frontend.types import Filled, Frame
 
@@ -71,21 +72,13 @@ class MonoInitialiser:
             return None
         return result, ids
 
-    def fill(
-        self, session: int, reference_id: int, T_odom_reference: NDArray[np.float64], landmark_of: "dict[int, int]",
-        positions: NDArray[np.float64],
-    ) -> tuple[Filled, ...]:
-        """Give the views between the first and the newest their poses against the new landmarks.
-
-        ``landmark_of`` maps track ids to rows of ``positions`` (N, 3) in the odometry frame.
-        """
-        filled = []
+    def fill(self, session: Session, keyframe_id: int, T_odom_first: NDArray[np.float64]) -> tuple[Filled, ...]:
+        """Give the views between the first and the newest their poses against the new landmarks."""
+        filled = [Filled(self.first.index, self.first.stamp_ns, session.id, keyframe_id, np.eye(4))]
         c = self.config
         for view in self.views[1:-1]:
-            rows = np.array([landmark_of.get(int(t), -1) for t in view.tracks.ids])
-            known = rows >= 0
-            unknown_depth = np.full(int(known.sum()), np.nan)
-            observations = Observations(positions[rows[known]], view.pixels[known], unknown_depth, unknown_depth)
+            unknown = np.full(len(view.tracks), np.nan)
+            observations, _ = session.observations(view.tracks, unknown, unknown)
             pose = estimate_pose(
                 observations,
                 self.camera,
@@ -95,6 +88,35 @@ class MonoInitialiser:
                 minimum=c.min_inliers,
             )
             if pose is not None:
-                T = se3.inverse(T_odom_reference) @ pose.T_odom_cam
-                filled.append(Filled(view.index, view.stamp_ns, session, reference_id, T))
+                T_first_cam = se3.inverse(T_odom_first) @ pose.T_odom_cam
+                filled.append(Filled(view.index, view.stamp_ns, session.id, keyframe_id, T_first_cam))
         return tuple(filled)
+
+
+def insert_first_keyframes(
+    session: Session,
+    initialiser: MonoInitialiser,
+    frame: Frame,
+    grey: NDArray[np.uint8],
+    two_view: TwoView,
+    ids: NDArray[np.int64],
+    builder: KeyframeBuilder,
+) -> tuple[Filled, ...]:
+    """Make the first and the newest view the first two keyframes; returns the poses of the views before the newest."""
+    T_odom_first, first, live = session.T_odom_cam, initialiser.views[0], session.tracks
+    session.landmarks.set(ids, se3.transform(T_odom_first, two_view.landmarks))
+    a = builder.request(initialiser.first, session.id, None, T_odom_first, None)
+    session.tracks = first.tracks[np.isin(first.tracks.ids, live.ids)]
+    unknown = np.full(len(session.tracks), np.nan)
+    session.insert_keyframe(a.id, first.stamp_ns, T_odom_first, unknown, unknown)
+
+    session.tracks = live
+    session.add_corners(grey)
+    unknown = np.full(len(session.tracks), np.nan)
+    session.insert_keyframe(builder.next_id, frame.stamp_ns, T_odom_first @ two_view.T_first_second, unknown, unknown)
+    session.velocity = np.eye(4)
+    session.last_pose_stamp_ns = frame.stamp_ns
+    covariance = motion_covariance(T_odom_first, session.T_odom_cam, np.zeros((6, 6)))
+    b = builder.request(frame, session.id, a.id, session.T_odom_cam, covariance)
+    builder.submit([a, b])
+    return initialiser.fill(session, a.id, T_odom_first)

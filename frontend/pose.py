@@ -53,7 +53,13 @@ class PoseEstimate:
 
 
 def estimate_pose(
-    observations: Observations, camera: Camera, *, threshold_px: float, iterations: int, pixel_sigma: float, minimum: int
+    observations: Observations,
+    camera: Camera,
+    *,
+    threshold_px: float,
+    iterations: int,
+    pixel_sigma: float,
+    minimum: int,
 ) -> PoseEstimate | None:
     """Estimate the pose without a guess; None when fewer than ``minimum`` landmarks agree.
 
@@ -173,7 +179,8 @@ def motion_covariance(
 ) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of the motion from a to b, of which ``covariance`` is the estimator's own at b.
 
-    The estimator takes the landmarks for exact; what their shared errors add grows with the distance and the angle moved.
+    The estimator takes the landmarks for exact; what their shared errors add grows with the distance and the angle
+    moved.
     """
     distance = float(np.linalg.norm(T_odom_b[:3, 3] - T_odom_a[:3, 3]))
     angle = float(se3.rotation_angle(T_odom_a[:3, :3].T @ T_odom_b[:3, :3]))

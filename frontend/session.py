@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.corners import detect_corners
 from seamark.frontend.pose import Observations
 from seamark.frontend.two_view import normalised_rays, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
@@ -67,6 +68,25 @@ class Session:
             np.concatenate([self.tracks.ids, fresh.ids]), np.vstack([self.tracks.pixels, fresh.pixels])
         )
         return fresh
+
+    def add_corners(self, grey: NDArray[np.uint8]) -> None:
+        """Begin tracks at new corners of a grey image where there are none."""
+        c = self.config
+        corners = detect_corners(
+            grey,
+            self.tracks.pixels,
+            c.max_corners,
+            harris=c.corner_detector == "harris",
+            min_response=c.min_corner_response,
+        )
+        self.new_tracks(corners)
+
+    def move(self, stamp_ns: int, T_odom_cam: NDArray[np.float64], tracks: Tracks) -> None:
+        """Take a new pose and the tracks seen from it."""
+        self.velocity = se3.inverse(self.T_odom_cam) @ T_odom_cam
+        self.T_odom_cam = T_odom_cam
+        self.tracks = tracks
+        self.last_pose_stamp_ns = stamp_ns
 
     def observations(
         self, tracks: Tracks, inverse_depth: NDArray[np.float64], inverse_sigma: NDArray[np.float64]

@@ -14,7 +14,9 @@ ESSENTIAL_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class TwoView:
-    """A first map: ``T_first_second`` with unit-median-depth scale, ``landmarks`` (N, 3) in the first camera, NaN where bad."""
+    """A first map: ``T_first_second`` with unit-median-depth scale, ``landmarks`` (N, 3) in the first camera, NaN
+    where bad.
+    """
 
     T_first_second: NDArray[np.float64]
     landmarks: NDArray[np.float64]
@@ -28,8 +30,8 @@ def triangulate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Intersect rays (N, 3) of two cameras; poses are (4, 4) or one per ray (N, 4, 4).
 
-    Returns the midpoints (N, 3) in the world, NaN behind either camera or for parallel rays, and the angles (N,) in radians
-    between the rays.
+    Returns the midpoints (N, 3) in the world, NaN behind either camera or for parallel rays, and the angles (N,) in
+    radians between the rays.
     """
     a = np.einsum("...ij,...j->...i", T_world_a[..., :3, :3], rays_a)
     b = np.einsum("...ij,...j->...i", T_world_b[..., :3, :3], rays_b)
@@ -52,7 +54,10 @@ def triangulate(
 
 
 def rotation_compensated_parallax(
-    R_first_second: NDArray[np.float64], pixels_first: NDArray[np.float64], rays_second: NDArray[np.float64], camera: Camera
+    R_first_second: NDArray[np.float64],
+    pixels_first: NDArray[np.float64],
+    rays_second: NDArray[np.float64],
+    camera: Camera,
 ) -> NDArray[np.float64]:
     """Return how far (N,) in pixels points moved beyond what the rotation alone explains."""
     turned = rays_second @ R_first_second.T
@@ -71,9 +76,9 @@ def initialise(
 ) -> TwoView | str:
     """Build a first map from two views, or say in a word why it is not yet safe.
 
-    Ideal pixels (N, 2) of the same corners. An essential matrix (MAGSAC++, Barath 2020) gives the motion; it is refused for
-    little parallax after the rotation is taken out (pure rotation), for few points in front of both cameras or with
-    a wide enough angle. The median depth becomes 1.
+    Ideal pixels (N, 2) of the same corners. An essential matrix (MAGSAC++, Barath 2020) gives the motion; it is
+    refused for little parallax after the rotation is taken out (pure rotation), for few points in front of both
+    cameras or with a wide enough angle. The median depth becomes 1.
     """
     if len(pixels_first) < min_landmarks:
         return "few_tracks"

@@ -61,8 +61,8 @@ class Frame:
     """One moment of the sensor.
 
     ``image`` is (H, W) grey or (H, W, 3) BGR, uint8. ``image_right`` is (H, W) or (H, W, 3) uint8 for stereo. ``depth``
-    is (H, W) along the optical axis of ``image``: float32 metres, or uint16 in units of 1 / ``rig.depth_factor`` metres;
-    zero and non-finite mean unknown. ``file`` names the frame in reports.
+    is (H, W) along the optical axis of ``image``: float32 metres, or uint16 in units of 1 / ``rig.depth_factor``
+    metres; zero and non-finite mean unknown. ``file`` names the frame in reports.
     """
 
     index: int
@@ -108,8 +108,8 @@ class Keyframe:
     ``id`` counts all keyframes of a run from 0. ``previous_id`` is the keyframe before it in the same session, or None.
     ``T_odom_cam`` is its odometry pose, None in mode places. ``covariance`` (6, 6) is of the motion since the previous
     keyframe. ``landmarks`` (N, 3) float32 are the features' points in this camera's frame, NaN where depth is unknown.
-    ``metric`` is False where the session's scale is arbitrary (mono). ``camera`` is None without calibration. ``jpeg`` is
-    the image, ``thumbnail`` a small (h, w) grey or (h, w, 3) BGR uint8 copy for the colour histograms.
+    ``metric`` is False where the session's scale is arbitrary (mono). ``camera`` is None without calibration.
+    ``jpeg`` is the image, ``thumbnail`` a small (h, w) grey or (h, w, 3) BGR uint8 copy for the colour histograms.
     """
 
     id: int
@@ -145,9 +145,9 @@ class Odometry:
 
     ``T_odom_cam`` is None when there is no pose. ``T_reference_cam`` is the same pose in the frame of keyframe
     ``reference_id``, from which the map's pose follows: ``T_map_reference @ T_reference_cam``. ``session`` is -1 when
-    the frame belongs to none. ``covariance`` (6, 6) is of the motion since the reference keyframe. ``filled`` gives poses
-    of earlier frames that became known with this one. ``tracks`` (M, 4) float32 are the inlier tracks (x, y, x_before,
-    y_before) in pixels, for people.
+    the frame belongs to none. ``covariance`` (6, 6) is of the motion since the reference keyframe. ``filled`` gives
+    poses of earlier frames that became known with this one. ``tracks`` (M, 4) float32 are the inlier tracks (x, y,
+    x_before, y_before) in pixels, for people.
     """
 
     index: int

@@ -1,7 +1,8 @@
 """The local window: bundle adjustment over the recent keyframes, in numpy with the landmarks eliminated.
 
-Triggs et al., "Bundle Adjustment - A Modern Synthesis" (2000), section 6.1: the reduced camera system has 6 rows per keyframe.
-A window of 8 keyframes and 400 landmarks is one small dense system, so that plain arrays beat a general graph solver here.
+Triggs et al., "Bundle Adjustment - A Modern Synthesis" (2000), section 6.1: the reduced camera system has 6 rows per
+keyframe. A window of 8 keyframes and 400 landmarks is one small dense system, so that plain arrays beat a general
+graph solver here.
 """
 
 from dataclasses import dataclass
@@ -90,7 +91,11 @@ def adjust(problem: BundleProblem, camera: Camera, *, pixel_sigma: float, iterat
 
 
 def _linearise(
-    problem: BundleProblem, poses: NDArray[np.float64], landmarks: NDArray[np.float64], camera: Camera, pixel_sigma: float
+    problem: BundleProblem,
+    poses: NDArray[np.float64],
+    landmarks: NDArray[np.float64],
+    camera: Camera,
+    pixel_sigma: float,
 ) -> _Linearised:
     R_cam_odom = np.swapaxes(poses[problem.keyframe_of, :3, :3], 1, 2)
     offset = landmarks[problem.landmark_of] - poses[problem.keyframe_of, :3, 3]
@@ -182,5 +187,7 @@ class LandmarkTable:
         """Drop everything below an id."""
         drop = track_id - self._first_id
         if drop > 4096:
-            self._positions = self._positions[drop:].copy() if drop < len(self._positions) else np.full((1024, 3), np.nan)
+            self._positions = (
+                self._positions[drop:].copy() if drop < len(self._positions) else np.full((1024, 3), np.nan)
+            )
             self._first_id = track_id

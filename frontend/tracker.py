@@ -1,0 +1,105 @@
+"""The parts of a tracking step: predict where tracks go, follow them, estimate the pose, decide about a keyframe."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.frontend import flow, se3
+from seamark.frontend.depth import DepthImage, DepthSensor
+from seamark.frontend.pose import PoseEstimate, estimate_pose
+from seamark.frontend.session import Session, Tracks
+from seamark.frontend.two_view import rotation_compensated_parallax
+from seamark.frontend.types import Frame
+
+GUESS_DEPTH = 1e3  # tracks without a landmark move as if far away: by the rotation only
+RETRY_SURVIVORS = 0.5
+STILL_PX = 1.0
+
+
+def predict_pixels(session: Session, tracks: Tracks) -> NDArray[np.float32]:
+    """Predict where tracks (N) will be seen, (N, 2), by constant velocity; unknown depths turn with the camera."""
+    T_predicted = session.T_odom_cam @ session.velocity
+    positions = session.landmarks.get(tracks.ids)
+    unknown = np.isnan(positions[:, 0])
+    far = session.camera.rays(tracks.pixels[unknown]) * GUESS_DEPTH
+    positions[unknown] = se3.transform(session.T_odom_cam, far)
+    in_cam = se3.transform(se3.inverse(T_predicted), positions)
+    visible = in_cam[:, 2] > 0.05
+    guess = tracks.pixels.copy()
+    guess[visible] = session.camera.project(in_cam[visible])
+    size = np.array([session.camera.width, session.camera.height])
+    outside = ((guess < 0) | (guess > size - 1)).any(axis=1)
+    guess[outside] = tracks.pixels[outside]
+    return guess
+
+
+def follow(
+    session: Session, before: NDArray[np.uint8], after: NDArray[np.uint8], *, predict: bool
+) -> tuple[Tracks, NDArray[np.float32]]:
+    """Follow the live tracks into the next grey image; returns the survivors and where they were (N, 2).
+
+    A prediction that loses half of the tracks was wrong: the image is then searched from where they were.
+    """
+    c, tracks = session.config, session.tracks
+    if len(tracks) == 0:
+        return tracks, tracks.pixels
+
+    def attempt(guess: NDArray[np.float32] | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        return flow.track(
+            before,
+            after,
+            tracks.pixels,
+            guess,
+            window_px=c.flow_window_px,
+            levels=c.flow_levels,
+            round_trip_px=c.flow_round_trip_px,
+        )
+
+    there, ok = attempt(predict_pixels(session, tracks) if predict else None)
+    if predict and ok.mean() < RETRY_SURVIVORS:
+        again, ok_again = attempt(None)
+        if ok_again.sum() > ok.sum():
+            there, ok = again, ok_again
+    return Tracks(tracks.ids[ok], there[ok]), tracks.pixels[ok]
+
+
+def estimate(
+    session: Session, sensor: DepthSensor, frame: Frame, tracks: Tracks
+) -> tuple[PoseEstimate | None, NDArray[np.bool_]]:
+    """Estimate the pose from the tracks with a landmark; returns it and which tracks (N,) it does not refute."""
+    c = session.config
+    unknown = np.full(len(tracks), np.nan)
+    # Depth images are read for free at every frame; a stereo match costs as much as the tracking and waits for
+    # keyframes.
+    reading = sensor.inverse_depth(frame, tracks.pixels) if isinstance(sensor, DepthImage) else (unknown, unknown)
+    observations, known = session.observations(tracks, *reading)
+    pose = estimate_pose(
+        observations,
+        session.camera,
+        threshold_px=c.pnp_threshold_px,
+        iterations=c.pnp_iterations,
+        pixel_sigma=c.pixel_sigma,
+        minimum=c.min_inliers,
+    )
+    keep = np.ones(len(tracks), bool)
+    if pose is not None:
+        keep[np.flatnonzero(known)[~pose.inliers]] = False
+    return pose, keep
+
+
+def keyframe_due(session: Session, stamp_ns: int, n_inliers: int) -> bool:
+    """Decide by what is still seen, rotation, parallax and the sensor's time, never by another clock."""
+    c, reference = session.config, session.reference
+    if n_inliers < max(c.good_inliers, c.keyframe_tracked_ratio * session.n_at_keyframe):
+        return True
+    R_reference_cam = reference.T_odom_cam[:3, :3].T @ session.T_odom_cam[:3, :3]
+    if float(se3.rotation_angle(R_reference_cam)) > np.deg2rad(c.keyframe_rotation_deg):
+        return True
+    _, i, j = np.intersect1d(reference.track_ids, session.tracks.ids, assume_unique=True, return_indices=True)
+    if len(i) == 0:
+        return True
+    rays = session.camera.rays(session.tracks.pixels[j])
+    parallax = float(
+        np.median(rotation_compensated_parallax(R_reference_cam, reference.pixels[i], rays, session.camera))
+    )
+    waited_s = 1e-9 * (stamp_ns - reference.stamp_ns)
+    return parallax > c.keyframe_parallax_px or (waited_s > c.keyframe_max_gap_s and parallax > STILL_PX)
