@@ -1,27 +1,44 @@
 """Settings of the vocabulary room."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class VocabConfig(BaseModel):
     """How places are described, compared and ranked.
 
-    The weights say how far each cue is believed: a place's score is the weighted mean of its votes and of the likeness of
-    its histograms, both in 0..1. Histograms follow the light, so by default they only decide between places whose votes
-    are nearly equal, and rank on their own where an image has no features.
+    The weights say how far each cue is believed: a place's score is the weighted mean of its votes and of the likeness
+    of its histograms, both in 0..1. Histograms follow the light, so by default they only decide between places whose
+    votes are nearly equal, and rank on their own where an image has no features.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    max_descriptors: int = Field(2000, ge=1, description="At most this many descriptors of an image become words.")
-    candidates: int = Field(10, ge=1, description="How many places a query returns at most.")
+    max_descriptors: int = Field(
+        default=2000, ge=1, description="At most this many descriptors of an image become words."
+    )
+    candidates: int = Field(default=10, ge=1, description="How many places a query returns at most.")
     exclude_recent_s: float = Field(
-        5.0, ge=0.0, description="Places of the same session nearer in time than this are not candidates, in seconds."
+        default=5.0,
+        ge=0.0,
+        description="Places of the same session nearer in time than this are not candidates, in seconds.",
     )
-    exclude_recent_count: int = Field(8, ge=0, description="The last so many places of a session are not candidates.")
-    votes_weight: float = Field(1.0, ge=0.0, description="Weight of the visual words in the score.")
-    histogram_weight: float = Field(0.1, ge=0.0, description="Weight of the colour histograms in the score.")
-    histogram_bins: int = Field(32, ge=4, le=256, description="Bins of each of the six histograms.")
+    exclude_recent_count: int = Field(
+        default=8, ge=0, description="The last so many places of a session are not candidates."
+    )
+    votes_weight: float = Field(default=1.0, ge=0.0, description="Weight of the visual words in the score.")
+    histogram_weight: float = Field(default=0.1, ge=0.0, description="Weight of the colour histograms in the score.")
+    histogram_bins: int = Field(default=32, ge=4, le=256, description="Bins of each of the six histograms.")
     histogram_sigma_bins: float = Field(
-        1.0, ge=0.0, le=16.0, description="Standard deviation of the Gaussian that smooths the histograms, in bins."
+        default=1.0,
+        ge=0.0,
+        le=16.0,
+        description="Standard deviation of the Gaussian that smooths the histograms, in bins.",
     )
+
+    @model_validator(mode="after")
+    def _some_cue_counts(self) -> Self:
+        if self.votes_weight + self.histogram_weight <= 0.0:
+            raise ValueError("votes_weight and histogram_weight must not both be 0")
+        return self

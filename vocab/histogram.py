@@ -46,9 +46,9 @@ def smoothing_matrix(bins: int, sigma_bins: float, *, circular: bool) -> NDArray
 def describe(thumbnail: NDArray[np.uint8], bins: int, sigma_bins: float) -> Histograms:
     """Return the r, g, b, h, s, l histograms of a (h, w, 3) BGR image, or l alone of a (h, w) grey one.
 
-    Hue, saturation and lightness are OpenCV's HLS, all scaled to 0..255. Each pixel counts in the hue histogram by its
-    saturation, because the hue of grey is noise. A BGR image whose channels are all equal has no colour and is taken as
-    grey, so that it compares with grey images.
+    Hue and saturation are OpenCV's HLS scaled to 0..255; lightness is the grey value (luma) and not HLS's mid-range, so
+    that a colour and a grey image of one place compare. Each pixel counts in the hue histogram by its saturation,
+    because the hue of grey is noise. A BGR image whose channels are all equal has no colour and is taken as grey.
 
     Raises:
         ObservationError: a thumbnail of another shape or type, or an empty one.
@@ -59,7 +59,8 @@ def describe(thumbnail: NDArray[np.uint8], bins: int, sigma_bins: float) -> Hist
         raise ObservationError(f"a thumbnail must be uint8 of (h, w) or (h, w, 3), not {_kind(thumbnail)}")
     counts = np.zeros((len(CHANNELS), bins))
     if thumbnail.ndim == 3 and (thumbnail != thumbnail[..., :1]).any():
-        hue, lightness, saturation = cv2.split(cv2.cvtColor(thumbnail, cv2.COLOR_BGR2HLS_FULL))
+        hue, _, saturation = cv2.split(cv2.cvtColor(thumbnail, cv2.COLOR_BGR2HLS_FULL))
+        lightness = cv2.cvtColor(thumbnail, cv2.COLOR_BGR2GRAY)
         planes = (*(thumbnail[..., c] for c in (2, 1, 0)), hue, saturation, lightness)
         for channel, plane in enumerate(planes):
             counts[channel] = _count(plane, bins, saturation if channel == HUE else None)
@@ -73,9 +74,9 @@ def describe(thumbnail: NDArray[np.uint8], bins: int, sigma_bins: float) -> Hist
 def jeffrey_divergence(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return J(p, q) = sum p ln(p / m) + q ln(q / m) with m = (p + q) / 2 over the last axis.
 
-    Puzicha, Hofmann and Buhmann 1997, twice the Jensen-Shannon divergence: symmetric, 0 for equal distributions, at most
-    2 ln 2. Convention for empty bins: a term with p = 0 (or q = 0) counts nothing, its limit; m is then not zero unless
-    both are. ``p`` and ``q`` broadcast against each other.
+    Puzicha, Hofmann and Buhmann 1997, twice the Jensen-Shannon divergence: symmetric, 0 for equal distributions, at
+    most 2 ln 2. Convention for empty bins: a term with p = 0 (or q = 0) counts nothing, its limit; m is then not zero
+    unless both are. ``p`` and ``q`` broadcast against each other.
     """
     middle = (p + q) / 2
     # Where a bin is empty the quotient is replaced by 1, whose logarithm is 0; m >= p / 2 > 0 elsewhere.
@@ -92,14 +93,9 @@ def divergence_to_all(
 
     ``values`` (N, 6, bins) and ``present`` (N, 6) are those of the others; the result is (N,) float32.
     """
-    if not query.present[HUE] or not present.all():
-        common = present & query.present
-        channels = np.flatnonzero(common.any(axis=0))
-    else:
-        common = present
-        channels = np.arange(len(CHANNELS))
+    common = present & query.present
     total = np.zeros(len(values), np.float32)
-    for channel in channels:  # one at a time: the intermediate arrays stay in the cache
+    for channel in np.flatnonzero(common.any(axis=0)):  # one at a time: the intermediate arrays stay in the cache
         divergence = jeffrey_divergence(values[:, channel], query.values[channel])
         total += np.where(common[:, channel], divergence, 0)
     mean: NDArray[np.float32] = total / np.maximum(common.sum(axis=1), 1).astype(np.float32)

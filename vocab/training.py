@@ -24,8 +24,8 @@ Progress = Callable[[str, int], None]
 class Sample:
     """A uniform sample of a stream.
 
-    ``descriptors`` (n, 128) uint8, ``image_ids`` (n,) int32 the batch each one came from, ``n_images`` and ``n_seen`` the
-    number of batches and descriptors in the whole stream.
+    ``descriptors`` (n, 128) uint8, ``image_ids`` (n,) int32 the batch each one came from, ``n_images`` and ``n_seen``
+    the number of batches and descriptors in the whole stream.
     """
 
     descriptors: NDArray[np.uint8]
@@ -46,8 +46,8 @@ def train(
 ) -> Vocabulary:
     """Cluster descriptors to visual words by k-means (Lloyd, faiss) and count in how many images each word is seen.
 
-    ``descriptor_batches`` gives one (N, 128) uint8 array for each image and is read once. At most ``max_descriptors`` are
-    kept, a uniform sample of all; the document frequencies are those of the sample. ``provenance`` is kept with the
+    ``descriptor_batches`` gives one (N, 128) uint8 array for each image and is read once. At most ``max_descriptors``
+    are kept, a uniform sample of all; the document frequencies are those of the sample. ``provenance`` is kept with the
     vocabulary beside the parameters of the training. Equal input and seed give equal bits: one thread is used.
 
     Raises:
@@ -102,7 +102,7 @@ def sample_descriptors(batches: Iterable[NDArray[np.uint8]], capacity: int, seed
 
 
 def document_frequency(words: NDArray[np.int32], image_ids: NDArray[np.int32], n_words: int) -> NDArray[np.int64]:
-    """Count for each word the images in which it is seen; ``words`` and ``image_ids`` are (n,), the result (n_words,)."""
+    """Count for each word the images that show it; ``words`` and ``image_ids`` are (n,), the result (n_words,)."""
     pairs = np.unique(image_ids.astype(np.int64) * n_words + words)
     return np.bincount(pairs % n_words, minlength=n_words).astype(np.int64)
 
@@ -120,4 +120,5 @@ def _cluster(descriptors: NDArray[np.uint8], n_words: int, seed: int, iterations
     codec.is_trained = True
     clustering.train_encoded(descriptors, codec, faiss.IndexFlatL2(DESCRIPTOR_SIZE))
     centres = faiss.vector_to_array(clustering.centroids).reshape(n_words, DESCRIPTOR_SIZE)
-    return np.clip(np.rint(centres), 0, 255).astype(np.uint8)
+    words: NDArray[np.uint8] = np.clip(np.rint(centres), 0, 255).astype(np.uint8)
+    return words

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 class PlaceObservation:
     """What one keyframe shows, as far as place recognition goes.
 
-    ``descriptors`` (N, 128) uint8 RootSIFT, ``points`` (N, 2) float32 pixels, ``thumbnail`` (h, w) grey or (h, w, 3) BGR
-    uint8. ``id`` and ``session`` are the keyframe's.
+    ``descriptors`` (N, 128) uint8 RootSIFT, ``points`` (N, 2) float32 pixels, ``thumbnail`` (h, w) grey or (h, w, 3)
+    BGR uint8. ``id`` and ``session`` are the keyframe's.
     """
 
     id: int

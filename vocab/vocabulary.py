@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.vocab import store
-from seamark.vocab.errors import ObservationError
+from seamark.vocab.errors import ObservationError, VocabularyFileError
 
 DESCRIPTOR_SIZE = 128
 MIN_IDF = 1e-3  # a word seen in every training image hardly speaks, but an image of such words is still comparable
@@ -94,11 +94,15 @@ class Vocabulary:
         Raises:
             VocabularyFileError: the file is missing, damaged, or of an unknown version.
         """
-        return cls(*store.read(Path(path)))
+        words, idf, provenance = store.read(Path(path))
+        try:
+            return cls(words, idf, provenance)
+        except ObservationError as error:
+            raise VocabularyFileError(f"{path}: damaged vocabulary: {error}") from error
 
     @classmethod
     def default(cls) -> "Vocabulary":
-        """Return the vocabulary that ships with Seamark, trained on images made by benchmarks/train_default_vocabulary.py.
+        """Return the vocabulary that ships, trained on generated images by benchmarks/train_default_vocabulary.py.
 
         Raises:
             VocabularyFileError: the installation is damaged.
@@ -114,7 +118,10 @@ def check_descriptors(descriptors: NDArray[np.uint8]) -> None:
 
 
 def inverse_document_frequency(document_frequency: NDArray[np.int64], n_documents: int) -> NDArray[np.float32]:
-    """Return ln(documents / documents with the word) for each word, at least MIN_IDF; unseen words count as seen once."""
+    """Return ln(documents / documents with the word) for each word (n,) float32, at least MIN_IDF.
+
+    ``document_frequency`` is (n,); a word in no document counts as if it were in one.
+    """
     idf = np.log(max(n_documents, 1) / np.maximum(document_frequency, 1.0))
     return np.maximum(idf, MIN_IDF).astype(np.float32)
 

@@ -1,0 +1,67 @@
+"""Train the vocabulary that ships, vocab/default.vocab, on generated images only.
+
+    .venv/bin/python benchmarks/train_default_vocabulary.py
+
+About twelve CPU minutes on one core. The same versions of numpy, OpenCV and faiss make the same file. Nothing here may
+ever read a photograph: what the vocabulary is judged on, it has never seen.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.datasets_synth.imagery import training_images
+from seamark.frontend.features import extract_features
+from seamark.vocab.training import train
+
+DEFAULT_OUTPUT = Path(__file__).resolve().parent.parent / "vocab" / "default.vocab"
+
+
+def descriptor_batches(seed: int, n_images: int, n_features: int) -> Iterator[NDArray[np.uint8]]:
+    for image in training_images(seed, n_images):
+        yield extract_features(image, n_features).descriptors
+
+
+def show(stage: str, count: int) -> None:
+    if stage != "reading" or count % 100 == 0:
+        print(f"{stage} {count}  {time.process_time():.0f} s CPU", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=int, default=900)
+    parser.add_argument("--features", type=int, default=1000, help="per image, as the front end takes them")
+    parser.add_argument("--words", type=int, default=16384)
+    parser.add_argument("--iterations", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=20)
+    parser.add_argument("--out", type=Path, default=DEFAULT_OUTPUT)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    provenance = {
+        "images": "seamark.datasets_synth.imagery.training_images, 640x480",
+        "image_seed": options.seed,
+        "features_per_image": options.features,
+        "versions": {name: version(name) for name in ("numpy", "opencv-contrib-python-headless", "faiss-cpu")},
+        "licence": "Apache-2.0",
+    }
+    batches = descriptor_batches(options.seed, options.images, options.features)
+    vocabulary = train(
+        batches,
+        options.words,
+        options.seed,
+        iterations=options.iterations,
+        provenance=provenance,
+        progress=show,
+    )
+    vocabulary.save(options.out)
+    print(f"{options.out}: {vocabulary.n_words} words, {options.out.stat().st_size} bytes, {vocabulary.hash}")
+
+
+if __name__ == "__main__":
+    main()

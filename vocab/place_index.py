@@ -1,0 +1,162 @@
+"""The places seen so far, and which of them an image may show."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.vocab import histogram
+from seamark.vocab.config import VocabConfig
+from seamark.vocab.errors import DuplicatePlaceError, UnknownPlaceError
+from seamark.vocab.histogram import Histograms
+from seamark.vocab.inverted_index import InvertedIndex
+from seamark.vocab.types import Candidate, Candidates, PlaceObservation
+from seamark.vocab.vocabulary import Vocabulary, check_descriptors
+
+NANOSECONDS = 1_000_000_000
+NO_PLACE = -1
+
+
+class PlaceIndex:
+    """Ranks all places by how much they look like an image: votes of visual words and likeness of colour histograms.
+
+    The score is the weighted mean of the votes and of 1 - J / (2 ln 2), J the Jeffrey divergence; see VocabConfig for
+    the weights. The recent past of the image's own session is never a candidate, nor is the image itself.
+    """
+
+    def __init__(self, vocabulary: Vocabulary, config: VocabConfig | None = None) -> None:
+        self.vocabulary = vocabulary
+        self.config = config or VocabConfig()
+        self._inverted = InvertedIndex(vocabulary.idf)
+        self._slot_of: dict[int, int] = {}
+        self._added_to: dict[int, int] = {}  # session -> places ever added to it
+        self._table = np.zeros(0, _place_type(self.config.histogram_bins))
+
+    def __len__(self) -> int:
+        """Return the number of places."""
+        return len(self._slot_of)
+
+    def __contains__(self, place_id: int) -> bool:
+        """Return whether the place is in the index."""
+        return place_id in self._slot_of
+
+    def step(self, observation: PlaceObservation) -> Candidates:
+        """Rank the places that a keyframe may show, then add it as a place of its own.
+
+        Raises:
+            DuplicatePlaceError: its id is in the index already; nothing changes.
+            ObservationError: arrays of the wrong shape or type; nothing changes.
+        """
+        self._refuse_known(observation.id)
+        words, histograms = self._describe(observation)
+        candidates = self._rank(observation, words, histograms, self.config.candidates)
+        self._insert(observation, words, histograms)
+        return candidates
+
+    def add(self, observation: PlaceObservation) -> None:
+        """Add a place.
+
+        Raises:
+            DuplicatePlaceError: its id is in the index already; nothing changes.
+            ObservationError: arrays of the wrong shape or type; nothing changes.
+        """
+        self._refuse_known(observation.id)
+        self._insert(observation, *self._describe(observation))
+
+    def query(self, observation: PlaceObservation, limit: int | None = None) -> Candidates:
+        """Rank the places that an image may show: at most ``limit`` (default: the configuration's), best first.
+
+        Raises:
+            ObservationError: arrays of the wrong shape or type.
+        """
+        limit = self.config.candidates if limit is None else limit
+        return self._rank(observation, *self._describe(observation), limit)
+
+    def remove(self, place_id: int) -> None:
+        """Forget a place; its id may be added again.
+
+        Raises:
+            UnknownPlaceError: the index holds no such place.
+        """
+        if place_id not in self._slot_of:
+            raise UnknownPlaceError(f"place {place_id} is not in the index")
+        slot = self._slot_of.pop(place_id)
+        self._inverted.remove(slot)
+        self._table[slot]["id"] = NO_PLACE
+        self._table[slot]["live"] = False
+
+    def _refuse_known(self, place_id: int) -> None:
+        if place_id in self._slot_of:
+            raise DuplicatePlaceError(f"place {place_id} is in the index already")
+
+    def _describe(self, observation: PlaceObservation) -> tuple[NDArray[np.int32], Histograms]:
+        check_descriptors(observation.descriptors)
+        bins, sigma_bins = self.config.histogram_bins, self.config.histogram_sigma_bins
+        histograms = histogram.describe(observation.thumbnail, bins, sigma_bins)
+        return self.vocabulary.assign(observation.descriptors[: self.config.max_descriptors]), histograms
+
+    def _insert(self, observation: PlaceObservation, words: NDArray[np.int32], histograms: Histograms) -> None:
+        slot = self._inverted.add(words)
+        if slot >= len(self._table):
+            more = max(64, len(self._table) // 2)
+            self._table = np.concatenate([self._table, np.zeros(more, self._table.dtype)])
+        ordinal = self._added_to.get(observation.session, 0)
+        self._table[slot] = (
+            observation.id,
+            observation.session,
+            observation.stamp_ns,
+            ordinal,
+            True,
+            histograms.present,
+            histograms.values,
+        )
+        self._added_to[observation.session] = ordinal + 1
+        self._slot_of[observation.id] = slot
+
+    def _rank(
+        self, observation: PlaceObservation, words: NDArray[np.int32], histograms: Histograms, limit: int
+    ) -> Candidates:
+        places = self._table[: self._inverted.n_slots]
+        votes = self._inverted.votes(words).astype(np.float64)
+        jeffrey = histogram.divergence_to_all(histograms, places["values"], places["present"]).astype(np.float64)
+        score = self._fuse(votes, jeffrey)
+        slots = np.flatnonzero(self._eligible(observation, places))
+        if len(slots) > limit > 0:  # spare the sort of all: nothing below the limit-th score can be ranked
+            threshold = np.partition(score[slots], len(slots) - limit)[len(slots) - limit]
+            slots = slots[score[slots] >= threshold]
+        slots = slots[np.lexsort((places["id"][slots], -score[slots]))][:limit]
+        ranked = tuple(
+            Candidate(int(places["id"][s]), float(score[s]), float(votes[s]), float(jeffrey[s])) for s in slots
+        )
+        return Candidates(observation.id, observation.stamp_ns, ranked)
+
+    def _fuse(self, votes: NDArray[np.float64], jeffrey: NDArray[np.float64]) -> NDArray[np.float64]:
+        likeness = 1.0 - jeffrey / histogram.MAX_DIVERGENCE
+        by_votes, by_histogram = self.config.votes_weight, self.config.histogram_weight
+        fused: NDArray[np.float64] = (by_votes * votes + by_histogram * likeness) / (by_votes + by_histogram)
+        return np.clip(fused, 0.0, 1.0)
+
+    def _eligible(self, observation: PlaceObservation, places: NDArray[Any]) -> NDArray[np.bool_]:
+        same_session = places["session"] == observation.session
+        age_ns = np.abs(places["stamp_ns"] - observation.stamp_ns)
+        near = age_ns < round(self.config.exclude_recent_s * NANOSECONDS)
+        last = self._added_to.get(observation.session, 0) - self.config.exclude_recent_count
+        recent = same_session & (near | (places["ordinal"] >= last))
+        eligible: NDArray[np.bool_] = places["live"] & ~recent & (places["id"] != observation.id)
+        return eligible
+
+
+def _place_type(bins: int) -> np.dtype[Any]:
+    channels = len(histogram.CHANNELS)
+    return np.dtype(
+        [
+            ("id", np.int64),
+            ("session", np.int64),
+            ("stamp_ns", np.int64),
+            ("ordinal", np.int64),
+            ("live", np.bool_),
+            ("present", np.bool_, channels),
+            ("values", np.float32, (channels, bins)),
+        ],
+        align=True,
+    )
