@@ -9,8 +9,9 @@ class VocabConfig(BaseModel):
     """How places are described, compared and ranked.
 
     The weights say how far each cue is believed: a place's score is the weighted mean of its votes and of the likeness
-    of its histograms, both in 0..1. Histograms follow the light, so by default they only decide between places whose
-    votes are nearly equal, and rank on their own where an image has no features.
+    of its histograms, both in 0..1. Histograms follow the light, so by default they have half the say of the votes among
+    unrelated places (over generated images the votes spread by 0.025 and the likeness by 0.13), and rank on their own
+    only where an image has no features. Under generated changes of light any larger weight costs more than it gains.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -64,7 +64,7 @@ def test_a_second_round_finds_every_place_of_the_first(vocabulary: Vocabulary) -
         best = answer.ranked[0]
         assert answer.query_id == place + 50 and answer.stamp_ns == (place + 50) * SECOND
         assert best.id == place
-        assert 0.2 < best.votes < 0.9
+        assert 0.12 < best.votes < 0.7  # each look keeps 60 % of the words, so 36 % are common
         assert best.votes > 1.5 * answer.ranked[1].votes
         assert 0 <= best.jeffrey < 0.2
 
