@@ -55,7 +55,8 @@ def build_report(record: RunRecord, config: SeamarkConfig) -> dict[str, Any]:
         "versions": versions(),
         "config_hash": config_hash(config),
     }
-    return _plain(report)  # type: ignore[no-any-return]
+    plain: dict[str, Any] = _plain(report)
+    return plain
 
 
 def accuracy(record: RunRecord) -> dict[str, Any] | None:

@@ -70,12 +70,12 @@ def decode(data: bytes, name: str) -> NDArray[np.generic]:
     if data.startswith(PNG_SIGNATURE):
         _check_png(data, name)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image: NDArray[np.generic] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise UnreadableImageError(f"{name} cannot be decoded: {error.err}") from error
     if image is None or image.size == 0:
         raise UnreadableImageError(f"{name} cannot be decoded as an image")
-    return image  # type: ignore[no-any-return]
+    return image
 
 
 def jpeg_complete(data: bytes) -> bool:

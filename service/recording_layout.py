@@ -1,0 +1,33 @@
+"""How the viewer lays a recording out; the layout travels inside the file."""
+
+from typing import Any
+
+from seamark.frontend.types import Mode
+
+FRAME_TIMELINE = "frame"
+PLOTS = ("inliers", "quality", "reprojection_px", "latency_ms")
+
+
+def blueprint(mode: Mode) -> Any:
+    """Return the layout: map, camera, loops with their image pairs, log and plots; no map in mode places."""
+    import rerun.blueprint as rrb
+
+    plots = [rrb.TimeSeriesView(origin=f"/plots/{name}", name=name) for name in PLOTS]
+    pairs = rrb.Tabs(
+        rrb.Spatial2DView(origin="/loops/accepted/pair", name="Loops accepted"),
+        rrb.Spatial2DView(origin="/loops/rejected/pair", name="Loops rejected"),
+        rrb.TextLogView(origin="/", contents=["/logs", "/loops/**"], name="Log"),
+    )
+    camera = rrb.Spatial2DView(origin="/world/cam/image", name="Camera")
+    if mode is Mode.PLACES:
+        body = rrb.Vertical(rrb.Horizontal(camera, pairs), rrb.Tabs(*plots), row_shares=[3, 1])
+    else:
+        world = rrb.Spatial3DView(origin="/world", name="Map", contents=["/world/**", "- /world/cam/image/**"])
+        side = rrb.Vertical(camera, pairs, rrb.Tabs(*plots), row_shares=[3, 3, 2])
+        body = rrb.Horizontal(world, side, column_shares=[3, 2])
+    return rrb.Blueprint(
+        body,
+        rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )
