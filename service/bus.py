@@ -119,7 +119,7 @@ class Bus(Protocol):
         """
         ...
 
-    def subscribe(self, topic: Topic, callback: Callable[[Any], None]) -> None:
+    def subscribe(self, topic: Topic, callback: Callable[[Any], object]) -> None:
         """Receive a stream; a slow callback sees the newest messages only."""
         ...
 
@@ -146,7 +146,7 @@ class _Hub:
     def __init__(self, through_wire: bool) -> None:
         self.through_wire = through_wire
         self.handlers: dict[tuple[str, str], Handler] = {}
-        self.subscribers: dict[str, list[Callable[[Any], None]]] = {}
+        self.subscribers: dict[str, list[Callable[[Any], object]]] = {}
         self._queue: list[_Delivery] = []
         self._sequence = itertools.count()
         self._now_ns = 0
@@ -249,7 +249,7 @@ class LocalBus:
             raise WrongKindError(f"{self._node} is not a reader of topic {topic.name}")
         self._hub.handlers[topic.name, self._node] = callback
 
-    def subscribe(self, topic: Topic, callback: Callable[[Any], None]) -> None:
+    def subscribe(self, topic: Topic, callback: Callable[[Any], object]) -> None:
         """Receive every message of a stream."""
         check_kind(topic, Kind.STREAM)
         self._hub.subscribers.setdefault(topic.name, []).append(callback)

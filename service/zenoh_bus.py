@@ -136,7 +136,7 @@ class ZenohBus:
             )
         )
 
-    def subscribe(self, topic: Topic, callback: Callable[[Any], None]) -> None:
+    def subscribe(self, topic: Topic, callback: Callable[[Any], object]) -> None:
         """Receive a stream in a thread of its own; ``dropped`` counts what was lost on the way."""
         check_kind(topic, Kind.STREAM)
         self._check_open()
@@ -225,7 +225,7 @@ class ZenohBus:
         self._workers.append(pool)
         return pool.submit
 
-    def _receive(self, topic: Topic, subscriber: Any, callback: Callable[[Any], None]) -> None:
+    def _receive(self, topic: Topic, subscriber: Any, callback: Callable[[Any], object]) -> None:
         latest: dict[bytes, int] = {}
         for sample in subscriber:
             try:

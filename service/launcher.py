@@ -1,0 +1,256 @@
+"""Starts the three nodes as processes, restarts those that die, and stops them in order."""
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any, Self
+
+from seamark.service.bus import BusError
+from seamark.service.nodes.process import write_settings
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.requests import Empty, Status
+from seamark.service.topics import BACKEND, FRONTEND, NODES, RUNNER, STATUS, VOCAB
+from seamark.service.types import ProcessUsage
+from seamark.service.zenoh_bus import ZenohBus
+from seamark.service.zenoh_session import Watch, free_endpoint, open_session
+
+logger = logging.getLogger(__name__)
+
+START_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 30.0
+KILL_TIMEOUT_S = 5.0
+MAX_RESTARTS = 3
+# One thread per process and library: OpenCV, BLAS and OpenMP would otherwise fight for the same cores.
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+class NodeFailedError(BusError):
+    """A node could not start, or died more often than it may be restarted; the text is its own last word."""
+
+
+@dataclass
+class _Child:
+    """One process of a node and the thread that waits for its end."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    ended: threading.Event
+    exit_code: int | None = None
+    last_word: str = ""
+    peak_rss_bytes: int = 0
+    cpu_s: float = 0.0
+
+
+class Launcher:
+    """The three node processes and the session that connects them; a context manager.
+
+    Without ``settings.endpoint`` a Zenoh router runs in this process, on a free port of loopback or at ``listen``.
+    Nodes that die are restarted at most ``max_restarts`` times each. ``commands`` replaces how nodes are started.
+    Raises NodeFailedError, SessionError and TimedOutError.
+    """
+
+    def __init__(
+        self,
+        settings: NodeSettings,
+        *,
+        listen: str | None = None,
+        max_restarts: int = MAX_RESTARTS,
+        commands: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        own_router = not settings.endpoint
+        self.endpoint = settings.endpoint or listen or free_endpoint()
+        self._settings = replace(settings, endpoint=self.endpoint)
+        self._own_router = own_router
+        self._max_restarts = max_restarts
+        self._commands = commands or {
+            name: (sys.executable, "-m", f"seamark.service.nodes.{name}_node") for name in NODES
+        }
+        self._lock = threading.RLock()
+        self._children: dict[str, _Child] = {}
+        self._ended: list[_Child] = []
+        self._stopping = False
+        self._failure: NodeFailedError | None = None
+        self.restarts = dict.fromkeys(NODES, 0)
+        self._session: Any = None
+        self._watch: Watch | None = None
+        self._bus: ZenohBus | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self._open()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop(gently=kind is None)
+
+    @property
+    def session(self) -> Any:
+        """Return the Zenoh session of this process."""
+        return self._session
+
+    @property
+    def bus(self) -> ZenohBus:
+        """Return this process's bus, whose node is the runner."""
+        if self._bus is None:
+            raise NodeFailedError("the nodes are not running")
+        return self._bus
+
+    def check(self) -> None:
+        """Raise NodeFailedError if a node has died for good."""
+        if self._failure is not None:
+            raise self._failure
+
+    def process_id(self, node: str) -> int:
+        """Return the process id of a node."""
+        with self._lock:
+            return self._children[node].process.pid
+
+    def wait_until_alive(self, timeout_s: float = START_TIMEOUT_S) -> None:
+        """Wait until all nodes answer; raises NodeFailedError or TimedOutError."""
+        assert self._watch is not None
+        self._watch.wait_for(NODES, timeout_s, self.check)
+
+    def stop(self, gently: bool = True) -> tuple[ProcessUsage, ...]:
+        """Stop frontend, vocab and backend in this order and return what each has used; may be called again.
+
+        Each gets SIGTERM and time to finish; not ``gently``, or after that time, it is killed.
+        """
+        with self._lock:
+            self._stopping = True
+        for name in NODES:
+            self._stop_child(name, STOP_TIMEOUT_S if gently else KILL_TIMEOUT_S)
+        if self._bus is not None:
+            self._bus.close()
+            self._bus = None
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+        return self.usage()
+
+    def usage(self) -> tuple[ProcessUsage, ...]:
+        """Return what the processes that have ended have used, restarts of one node together."""
+        with self._lock:
+            ended = list(self._ended)
+        return tuple(
+            ProcessUsage(name, max(child.peak_rss_bytes for child in mine), sum(child.cpu_s for child in mine))
+            for name in NODES
+            if (mine := [child for child in ended if child.name == name])
+        )
+
+    def _open(self) -> None:
+        if self._own_router:
+            self._session = open_session("router", listen=[self.endpoint])
+        else:
+            self._session = open_session("client", connect=[self.endpoint])
+        self._watch = Watch(self._session, self._settings.namespace)
+        self._bus = ZenohBus(self._session, RUNNER, self._settings.namespace)
+        for name in reversed(NODES):  # readers first
+            with self._lock:
+                self._start(name, self._settings)
+        self.wait_until_alive()
+
+    def _start(self, name: str, settings: NodeSettings) -> None:
+        process = subprocess.Popen(
+            self._commands[name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1"),
+            start_new_session=True,  # Ctrl-C is for the parent, which stops the nodes in order
+        )
+        child = self._children[name] = _Child(name, process, threading.Event())
+        threading.Thread(target=self._follow, args=(child,), name=f"follow-{name}", daemon=True).start()
+        assert process.stdin is not None
+        try:
+            write_settings(process.stdin, settings)  # type: ignore[arg-type]
+        except BrokenPipeError:
+            logger.debug("%s ended before it read its settings", name)
+
+    def _follow(self, child: _Child) -> None:
+        """Wait for the end of a process, book what it has used, and restart it if it should live."""
+        os.waitid(os.P_PID, child.process.pid, os.WEXITED | os.WNOWAIT)
+        lines = _what_was_said(child.process).splitlines()
+        with self._lock:  # from here on the process id may be another's
+            _, status, usage = os.wait4(child.process.pid, 0)
+            child.exit_code = child.process.returncode = os.waitstatus_to_exitcode(status)
+            child.last_word = lines[-1] if lines else f"exit code {child.exit_code}"
+            child.peak_rss_bytes, child.cpu_s = 1024 * usage.ru_maxrss, usage.ru_utime + usage.ru_stime
+            self._ended.append(child)
+            self._children.pop(child.name, None)
+            child.ended.set()
+            if self._stopping:
+                return
+        self._replace(child)
+
+    def _replace(self, child: _Child) -> None:
+        sentence = f"the {child.name} node has ended: {child.last_word}"
+        # An error that it could name would come again; only what was killed or crashed is worth another try.
+        if child.exit_code == 1 or self.restarts[child.name] >= self._max_restarts:
+            logger.error("%s", sentence)
+            self._failure = NodeFailedError(sentence)
+            return
+        logger.warning("%s; it is started again", sentence)
+        settings = self._settings
+        if child.name == FRONTEND:
+            settings = self._counting_on(settings)
+        with self._lock:
+            if self._stopping:
+                return
+            self.restarts[child.name] += 1
+            self._start(child.name, settings)
+
+    def _counting_on(self, settings: NodeSettings) -> NodeSettings:
+        """Return the settings with which a new front end goes on counting after the keyframes that were sent."""
+        keyframe_id, session = settings.first_keyframe_id, settings.first_session
+        for node in (VOCAB, BACKEND):
+            try:
+                status: Status = self.bus.request(STATUS[node], Empty())
+            except BusError as error:
+                logger.warning("the %s node does not say how far it is: %s", node, error)
+                continue
+            keyframe_id = max(keyframe_id, status.counters.get("next_keyframe_id", 0))
+            session = max(session, status.counters.get("next_session", 0))
+        self._settings = replace(settings, first_keyframe_id=keyframe_id, first_session=session)
+        return self._settings
+
+    def _stop_child(self, name: str, timeout_s: float) -> None:
+        with self._lock:
+            child = self._children.get(name)
+        if child is None:
+            return
+        started = time.monotonic()
+        self._signal(child, signal.SIGTERM)
+        if not child.ended.wait(timeout_s):
+            logger.warning("%s has not stopped after %.0f s and is killed", name, time.monotonic() - started)
+            self._signal(child, signal.SIGKILL)
+            child.ended.wait()
+
+    def _signal(self, child: _Child, number: signal.Signals) -> None:
+        with self._lock:
+            if not child.ended.is_set():
+                os.kill(child.process.pid, number)
+
+
+def _what_was_said(process: "subprocess.Popen[bytes]") -> str:
+    """Return what a process that has ended wrote to standard output, and close its pipes."""
+    assert process.stdin is not None and process.stdout is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
+    with process.stdout as stdout:
+        os.set_blocking(stdout.fileno(), False)  # a grandchild may still hold the other end
+        return (stdout.read() or b"").decode(errors="replace").strip()

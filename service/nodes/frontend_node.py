@@ -1,0 +1,148 @@
+"""The front end as a node: frames in; odometry and keyframes out."""
+
+import sys
+import threading
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.frontend.odometry import Frontend
+from seamark.frontend.types import Frame, Keyframe, Odometry, Outcome, Quality
+from seamark.service import topics
+from seamark.service.bus import Bus
+from seamark.service.nodes.meter import Meter
+from seamark.service.nodes.process import run_process
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.requests import Done, EncodedFrame
+from seamark.service.sources.decode import UnreadableImageError, decode, to_image
+
+
+class FrontendNode:
+    """Feeds frames to the front end, one at a time, and sends on what comes out.
+
+    Frames come as requests, where none is lost, or from the stream of a live camera. Keyframe and session numbers begin
+    at ``first_keyframe_id`` and ``first_session``.
+    """
+
+    def __init__(self, bus: Bus, frontend: Frontend, *, first_keyframe_id: int = 0, first_session: int = 0) -> None:
+        self._bus = bus
+        self._frontend = frontend
+        self._first_keyframe_id = first_keyframe_id
+        self._first_session = first_session
+        self._meter = Meter(bus.node)
+        self._lock = threading.Lock()  # the camera's stream comes in a thread of its own
+        self._finished = False
+        bus.handle(topics.DRAIN[bus.node], self._on_drain)
+        bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
+        bus.handle(topics.FRAME, self._on_frame)
+        bus.subscribe(topics.CAMERA, self._on_frame)
+
+    def stop(self) -> None:
+        """Send the keyframes that are still being made and wait until all are acknowledged."""
+        with self._lock:
+            self._send(self._frontend.finish())
+        self._bus.drain()
+
+    def close(self) -> None:
+        """End the threads of the front end."""
+        self._frontend.close()
+
+    def _on_frame(self, received: Frame | EncodedFrame) -> Odometry:
+        with self._lock, self._meter.timed("frame"):
+            try:
+                frame = decode_frame(received)
+            except UnreadableImageError:
+                odometry = unreadable(received)
+            else:
+                result = self._frontend.step(frame)
+                odometry = self._shift_odometry(result.odometry)
+                self._send(result.keyframes)
+            self._bus.publish(topics.ODOMETRY, odometry)
+        self._meter.count("frames")
+        self._meter.count(f"frames_{odometry.outcome}")
+        self._meter.add(odometry.stages_ms)
+        return odometry
+
+    def _on_drain(self, _: object) -> Done:
+        self.stop()
+        return Done(self._bus.node)
+
+    def _send(self, keyframes: tuple[Keyframe, ...]) -> None:
+        for keyframe in keyframes:
+            self._bus.send(topics.KEYFRAME, self._shift_keyframe(keyframe))
+            self._meter.count("keyframes")
+
+    def _shift_keyframe(self, keyframe: Keyframe) -> Keyframe:
+        return replace(
+            keyframe,
+            id=keyframe.id + self._first_keyframe_id,
+            session=keyframe.session + self._first_session,
+            previous_id=self._shift_id(keyframe.previous_id),
+        )
+
+    def _shift_odometry(self, odometry: Odometry) -> Odometry:
+        return replace(
+            odometry,
+            session=self._shift_session(odometry.session),
+            reference_id=self._shift_id(odometry.reference_id),
+            keyframe_id=self._shift_id(odometry.keyframe_id),
+            filled=tuple(
+                replace(
+                    filled,
+                    session=self._shift_session(filled.session),
+                    reference_id=filled.reference_id + self._first_keyframe_id,
+                )
+                for filled in odometry.filled
+            ),
+        )
+
+    def _shift_id(self, keyframe_id: int | None) -> int | None:
+        return None if keyframe_id is None else keyframe_id + self._first_keyframe_id
+
+    def _shift_session(self, session: int) -> int:
+        return session if session < 0 else session + self._first_session
+
+
+def decode_frame(frame: Frame | EncodedFrame) -> Frame:
+    """Return the frame with all its pictures decoded; raises UnreadableImageError."""
+    if isinstance(frame, Frame):
+        return frame
+    name = frame.file or f"frame {frame.index}"
+    return Frame(
+        index=frame.index,
+        stamp_ns=frame.stamp_ns,
+        image=_decode_image(frame.image, name),
+        image_right=None if frame.image_right is None else _decode_image(frame.image_right, name),
+        depth=None if frame.depth is None else _decode_depth(frame.depth, name),
+        file=frame.file,
+    )
+
+
+def unreadable(frame: Frame | EncodedFrame) -> Odometry:
+    """Return what is said of a frame whose pictures cannot be decoded."""
+    return Odometry(frame.index, frame.stamp_ns, frame.file, -1, Quality.LOST, Outcome.UNREADABLE)
+
+
+def _decode_image(picture: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    return to_image(decode(picture, name), name) if isinstance(picture, bytes) else picture
+
+
+def _decode_depth(picture: Any, name: str) -> NDArray[np.uint16] | NDArray[np.float32]:
+    depth = decode(picture, name) if isinstance(picture, bytes) else picture
+    if depth.ndim != 2 or depth.dtype not in (np.uint16, np.float32):
+        raise UnreadableImageError(f"the depth of {name} is {depth.dtype} of shape {depth.shape}")
+    return np.ascontiguousarray(depth)
+
+
+def build(bus: Bus, settings: NodeSettings) -> FrontendNode:
+    """Return the node for the settings; raises CalibrationError."""
+    frontend = Frontend(settings.rig, settings.mode, settings.config.frontend)
+    return FrontendNode(
+        bus, frontend, first_keyframe_id=settings.first_keyframe_id, first_session=settings.first_session
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(run_process(topics.FRONTEND, build))

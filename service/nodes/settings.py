@@ -1,0 +1,30 @@
+"""What a node's process is told when it starts."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from seamark.frontend.types import Mode, Rig
+from seamark.service.config import SeamarkConfig, load_config
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSettings:
+    """Settings of all three nodes; can be pickled.
+
+    ``vocabulary`` None is the one that ships with Seamark. ``map_path`` None keeps the map in memory only.
+    ``first_keyframe_id`` and ``first_session`` let a front end that was restarted go on counting. ``solver_process``
+    puts the pose graph's solver into a process of its own, so that queries stay answered while it works.
+    """
+
+    mode: Mode
+    rig: Rig | None = None
+    config: SeamarkConfig = field(default_factory=load_config)
+    vocabulary: Path | None = None
+    map_path: Path | None = None
+    no_loops: bool = False
+    endpoint: str = ""
+    namespace: str = "default"
+    first_keyframe_id: int = 0
+    first_session: int = 0
+    solver_process: bool = True
+    log_level: str = "WARNING"

@@ -1,0 +1,83 @@
+"""The vocabulary as a node: keyframes in, ranked places out."""
+
+import sys
+from collections.abc import Iterable
+from concurrent.futures import Future
+
+from seamark.frontend.types import Keyframe
+from seamark.service import topics
+from seamark.service.bus import Bus
+from seamark.service.nodes.meter import Meter
+from seamark.service.nodes.process import run_process
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.requests import Done
+from seamark.vocab.place_index import PlaceIndex
+from seamark.vocab.types import Candidates, PlaceObservation
+from seamark.vocab.vocabulary import Vocabulary
+
+
+class VocabNode:
+    """Asks the index about every keyframe, then adds it; answers query images without adding them.
+
+    ``known`` are the places of the map from before, in the order in which they were seen.
+    """
+
+    def __init__(self, bus: Bus, index: PlaceIndex, known: Iterable[PlaceObservation] = ()) -> None:
+        self._bus = bus
+        self._index = index
+        self._meter = Meter(bus.node)
+        for observation in known:
+            index.add(observation)
+        self._meter.keep("places", len(index))
+        bus.handle(topics.DRAIN[bus.node], self._on_drain)
+        bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
+        bus.handle(topics.PLACES_RANK, self._on_rank)
+        bus.handle(topics.KEYFRAME, self._on_keyframe)
+
+    def stop(self) -> None:
+        """Wait until all candidates are acknowledged."""
+        self._bus.drain()
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _on_keyframe(self, keyframe: Keyframe) -> "Future[None]":
+        """Rank and add; the keyframe is acknowledged when its candidates are."""
+        observation = observe(keyframe)
+        with self._meter.timed("rank"):
+            known = keyframe.id in self._index  # sent again after a restart
+            candidates = self._index.query(observation) if known else self._index.step(observation)
+        self._meter.count("keyframes_again" if known else "keyframes")
+        self._meter.keep("places", len(self._index))
+        return self._bus.send(topics.CANDIDATES, candidates)
+
+    def _on_rank(self, observation: PlaceObservation) -> Candidates:
+        with self._meter.timed("rank_query"):
+            return self._index.query(observation)
+
+    def _on_drain(self, _: object) -> Done:
+        self.stop()
+        return Done(self._bus.node)
+
+
+def observe(keyframe: Keyframe) -> PlaceObservation:
+    """Return what place recognition needs of a keyframe."""
+    return PlaceObservation(
+        keyframe.id,
+        keyframe.session,
+        keyframe.stamp_ns,
+        keyframe.features.descriptors,
+        keyframe.features.points,
+        keyframe.thumbnail,
+    )
+
+
+def build(bus: Bus, settings: NodeSettings) -> VocabNode:
+    """Return the node for the settings; raises VocabularyFileError."""
+    path = settings.vocabulary
+    vocabulary = Vocabulary.default() if path is None else Vocabulary.load(path)
+    return VocabNode(bus, PlaceIndex(vocabulary, settings.config.vocab))
+
+
+if __name__ == "__main__":
+    sys.exit(run_process(topics.VOCAB, build))

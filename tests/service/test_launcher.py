@@ -1,0 +1,137 @@
+"""Node processes come alive, are replaced when they die, say why they cannot start, and stop in order."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from seamark.frontend.types import Frame, Mode
+from seamark.service import launcher as launcher_module
+from seamark.service.bus import BusError, UnavailableError
+from seamark.service.launcher import Launcher, NodeFailedError
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.requests import Empty
+from seamark.service.topics import BACKEND, FRAME, FRONTEND, NODES, STATUS, VOCAB
+
+pytestmark = pytest.mark.zenoh
+SCRIPT = str(Path(__file__).with_name("fake_node.py"))
+PATIENCE_S = 60.0
+
+
+def launch(path: Path, behaviour: str = "well", max_restarts: int = 3) -> Launcher:
+    settings = NodeSettings(Mode.RGBD, map_path=path / "stopped.txt", namespace="launcher")
+    commands = {name: (sys.executable, SCRIPT, name, behaviour) for name in NODES}
+    return Launcher(settings, commands=commands, max_restarts=max_restarts)
+
+
+def frame(index: int) -> Frame:
+    return Frame(index, 0, np.zeros((2, 2), np.uint8), file=f"a/{index}")
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def gone(process_id: int) -> bool:
+    try:
+        os.kill(process_id, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def test_nodes_answer_and_stop_in_order(tmp_path: Path) -> None:
+    with launch(tmp_path) as launcher:
+        for node in NODES:
+            status = launcher.bus.request(STATUS[node], Empty(), PATIENCE_S)
+            assert status.node == node and status.pid == launcher.process_id(node)
+            assert status.counters["threads"] == 1
+        assert launcher.bus.request(FRAME, frame(3), PATIENCE_S).file == "3"
+        pids = [launcher.process_id(node) for node in NODES]
+    assert (tmp_path / "stopped.txt").read_text(encoding="utf-8").split() == [FRONTEND, VOCAB, BACKEND]
+    assert all(gone(pid) for pid in pids)
+    usage = launcher.stop()
+    assert [one.name for one in usage] == list(NODES)
+    assert all(20e6 < one.peak_rss_bytes < 2e9 and 0.01 < one.cpu_s < 60 for one in usage)
+    with pytest.raises(NodeFailedError):
+        _ = launcher.bus
+
+
+def test_a_killed_node_is_replaced_and_goes_on_counting(tmp_path: Path) -> None:
+    with launch(tmp_path) as launcher:
+        with pytest.raises(UnavailableError):
+            launcher.bus.request(FRAME, frame(13), PATIENCE_S)  # kills the front end
+        wait_until(lambda: launcher.restarts[FRONTEND] == 1)
+
+        def answers() -> bool:
+            try:
+                return bool(launcher.bus.request(STATUS[FRONTEND], Empty()).counters["first"] == 7)
+            except BusError:
+                return False
+
+        wait_until(answers)
+        assert launcher.bus.request(FRAME, frame(14), PATIENCE_S).index == 14
+        launcher.check()
+    assert len((tmp_path / "stopped.txt").read_text(encoding="utf-8").split()) == 3
+
+
+def test_a_node_that_dies_too_often_is_given_up(tmp_path: Path) -> None:
+    with launch(tmp_path, max_restarts=0) as launcher:
+        os.kill(launcher.process_id(VOCAB), signal.SIGKILL)
+
+        def failed() -> bool:
+            try:
+                launcher.check()
+            except NodeFailedError as error:
+                assert "the vocab node has ended: exit code -9" in str(error)
+                return True
+            return False
+
+        wait_until(failed)
+
+
+def test_a_node_that_cannot_start_says_why(tmp_path: Path) -> None:
+    with pytest.raises(NodeFailedError, match=r"the vocab node has ended: the vocabulary words\.npz is damaged"):
+        launch(tmp_path, "ill").__enter__()
+
+
+def test_a_node_that_does_not_stop_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launcher_module, "STOP_TIMEOUT_S", 0.3)
+    with launch(tmp_path, "stubborn") as launcher:
+        process_id = launcher.process_id(BACKEND)
+    assert gone(process_id)
+    assert "backend" not in (tmp_path / "stopped.txt").read_text(encoding="utf-8")
+
+
+def test_nodes_do_not_outlive_a_parent_that_was_killed(tmp_path: Path) -> None:
+    code = f"""
+import sys, time
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from test_launcher import launch, NODES
+launcher = launch(Path({str(tmp_path)!r})).__enter__()
+print(*[launcher.process_id(node) for node in NODES], flush=True)
+time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pids = [int(word) for word in parent.stdout.readline().split()]
+        assert len(pids) == 3 and not any(gone(pid) for pid in pids)
+        parent.kill()
+    wait_until(lambda: all(gone(pid) or _is_zombie(pid) for pid in pids))
+
+
+def _is_zombie(process_id: int) -> bool:
+    try:
+        return ") Z " in Path(f"/proc/{process_id}/stat").read_text(encoding="ascii")
+    except OSError:
+        return True
