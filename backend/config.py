@@ -43,6 +43,7 @@ class VerificationConfig(_Section):
     translation_floor_fraction: float = Field(
         default=0.01, gt=0, description="least standard deviation of a loop's translation per median depth"
     )
+    locate_inliers: int = Field(default=25, ge=6, description="inliers from which a single image is localised")
     min_scale_pairs: int = Field(
         default=10, ge=3, description="inliers with depth in both views needed for a loop's scale"
     )

@@ -1,5 +1,7 @@
 """What a keyframe's pose is to GTSAM: a rigid pose, or one with a scale."""
 
+from typing import Any
+
 import gtsam
 import gtsam.utilities
 import numpy as np
@@ -19,7 +21,7 @@ class PoseVariables:
     def __init__(self, config: GraphConfig, drift: DriftConfig) -> None:
         self._config, self._drift = config, drift
 
-    def value(self, M: Matrix) -> gtsam.Pose3 | gtsam.Similarity3:
+    def value(self, M: Matrix) -> Any:
         """Return the variable of pose M."""
         return gtsam.Pose3(gtsam.Rot3.ClosestTo(M[:3, :3]), M[:3, 3])
 
@@ -60,7 +62,7 @@ class PoseVariables:
 class SimilarityVariables(PoseVariables):
     """Poses with a scale: GTSAM's Similarity3 is p' = s (R p + t), tangent rotation, translation, log scale."""
 
-    def value(self, M: Matrix) -> gtsam.Pose3 | gtsam.Similarity3:
+    def value(self, M: Matrix) -> Any:
         """Return the variable of M = [sR t; 0 1]."""
         scale = float(np.cbrt(np.linalg.det(M[:3, :3])))
         return gtsam.Similarity3(gtsam.Rot3.ClosestTo(M[:3, :3] / scale), M[:3, 3] / scale, scale)

@@ -47,7 +47,8 @@ class Loop:
 class MapSnapshot:
     """The whole map at one revision.
 
-    ``keyframe_ids`` (N,) int64 ascending, ``sessions`` (N,) int64, ``T_map_cam`` (N, 4, 4), NaN where a keyframe has no pose.
+    ``keyframe_ids`` (N,) int64 ascending, ``sessions`` (N,) int64, ``T_map_cam`` (N, 4, 4), NaN where a keyframe has
+    no pose.
     ``components`` (N,) int64: keyframes with the same number share one frame of reference (sessions joined by loops).
     ``scales`` (N,): how many map units one unit of the session's odometry is (1 for metric sessions).
     """

@@ -1,0 +1,74 @@
+"""The map as the back end knows it between two optimisations."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.backend.graph_types import Estimate
+from seamark.backend.types import Loop, MapSnapshot
+from seamark.frontend import se3
+from seamark.frontend.types import Keyframe
+
+Matrix = NDArray[np.float64]
+
+
+class MapState:
+    """Keyframes with their last optimised poses; newer ones hang on these by odometry. Not locked."""
+
+    def __init__(self) -> None:
+        self.keyframes: dict[int, Keyframe] = {}
+        self.revision = 0
+        self._poses: dict[int, Matrix] = {}
+        self._scales: dict[int, float] = {}
+        self._components: dict[int, int] = {}  # of each session
+        self._last: dict[int, int] = {}
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Append a keyframe: a new session in its own frame, else by its motion since the previous keyframe."""
+        previous_id = keyframe.previous_id if keyframe.previous_id is not None else self._last.get(keyframe.session)
+        self.keyframes[keyframe.id] = keyframe
+        self._last[keyframe.session] = keyframe.id
+        self._components.setdefault(keyframe.session, keyframe.session)
+        if keyframe.T_odom_cam is None:
+            return
+        if previous_id is None:
+            self._poses[keyframe.id], self._scales[keyframe.id] = keyframe.T_odom_cam, 1.0
+            return
+        T_odom_previous = self.keyframes[previous_id].T_odom_cam
+        assert T_odom_previous is not None
+        self._scales[keyframe.id] = self._scales[previous_id]
+        self._poses[keyframe.id] = self._chain(previous_id, se3.inverse(T_odom_previous) @ keyframe.T_odom_cam)
+
+    def take(self, estimate: Estimate) -> None:
+        """Replace all poses by those of the solver, which knows the same keyframes."""
+        self.revision = estimate.revision
+        ids = estimate.keyframe_ids.tolist()
+        self._poses = dict(zip(ids, estimate.T_map_cam, strict=True))
+        self._scales = dict(zip(ids, estimate.scales.tolist(), strict=True))
+        for keyframe_id, component in zip(ids, estimate.components.tolist(), strict=True):
+            self._components[self.keyframes[keyframe_id].session] = component
+
+    def pose_of_neighbour(self, keyframe_id: int, T_keyframe_cam: Matrix) -> Matrix | None:
+        """Return ``T_map_cam`` of a camera near a keyframe (translation in its units), None without poses."""
+        if keyframe_id not in self._poses:
+            return None
+        return self._chain(keyframe_id, T_keyframe_cam)
+
+    def snapshot(self, loops: tuple[Loop, ...]) -> MapSnapshot:
+        """Return all keyframes by ascending id."""
+        ids = sorted(self.keyframes)
+        nowhere = np.full((4, 4), np.nan)
+        sessions = [self.keyframes[i].session for i in ids]
+        return MapSnapshot(
+            revision=self.revision,
+            keyframe_ids=np.array(ids, np.int64),
+            sessions=np.array(sessions, np.int64),
+            components=np.array([self._components[session] for session in sessions], np.int64),
+            T_map_cam=np.array([self._poses.get(i, nowhere) for i in ids], np.float64).reshape(-1, 4, 4),
+            scales=np.array([self._scales.get(i, 1.0) for i in ids], np.float64),
+            loops=loops,
+        )
+
+    def _chain(self, keyframe_id: int, T_keyframe_cam: Matrix) -> Matrix:
+        scaled = T_keyframe_cam.copy()
+        scaled[:3, 3] *= self._scales[keyframe_id]
+        return self._poses[keyframe_id] @ scaled

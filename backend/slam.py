@@ -1,0 +1,273 @@
+"""Keyframes and place candidates to verified loops and one consistent map."""
+
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from seamark.backend.chain import OdometryChains
+from seamark.backend.config import BackendConfig
+from seamark.backend.consistency import gate_chi2
+from seamark.backend.errors import BackendInputError
+from seamark.backend.graph_types import Constraint, Node, Solver, check_node
+from seamark.backend.ledger import Finding, Key, LoopLedger, PlaceRelation, PoseRelation
+from seamark.backend.map_state import MapState
+from seamark.backend.types import Loop, MapSnapshot, Place, Reason
+from seamark.backend.verify import Rejected, Verification, verify
+from seamark.frontend.types import Keyframe, Mode
+from seamark.vocab.types import Candidate, Candidates
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """What one keyframe has brought.
+
+    ``loops``: one per verified candidate, and earlier ones whose verdict has changed. ``optimised``: whether poses of
+    earlier keyframes may have moved. ``timings_ms`` per stage: verify, consistency, optimise.
+    """
+
+    loops: tuple[Loop, ...]
+    revision: int
+    optimised: bool
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+class Slam:
+    """The back end's memory and its decisions.
+
+    ``solver`` is a PoseGraph or SolverProcess; None only in mode places, which knows no poses. ``step`` and ``finish``
+    belong to one thread, ``locate`` and ``snapshot`` may be called from others. Features and landmarks of all
+    keyframes stay in memory, images do not. Same input and ``seed``, same result.
+    """
+
+    def __init__(self, config: BackendConfig, mode: Mode, solver: Solver | None, seed: int) -> None:
+        if (mode == Mode.PLACES) != (solver is None):
+            raise BackendInputError(f"mode {mode} needs {'no' if mode == Mode.PLACES else 'a'} solver")
+        self._config, self._solver, self._seed = config, solver, seed
+        self._chains = OdometryChains(config.drift)
+        relation = PlaceRelation(config.places) if solver is None else PoseRelation(self._chains, config.consistency)
+        self._ledger = LoopLedger(relation, config.consistency.compared_loops, config.consistency.clique_starts)
+        self._map = MapState()
+        self._loops: dict[Key, Loop] = {}
+        self._lock = threading.Lock()
+
+    def __contains__(self, keyframe_id: int) -> bool:
+        """Return whether the keyframe has been taken in: messages may be delivered twice."""
+        return keyframe_id in self._map.keyframes
+
+    def step(self, keyframe: Keyframe, candidates: Candidates) -> StepResult:
+        """Take in a keyframe and the places that it may show; raises BackendInputError when it is malformed."""
+        timings_ms = {}
+        # Hang the keyframe on its predecessor by odometry.
+        self._add(keyframe)
+
+        # Verify one candidate per island of neighbouring keyframes, the best first.
+        started = time.perf_counter()
+        verified = self._verify(keyframe, candidates)
+        timings_ms["verify"] = 1e3 * (time.perf_counter() - started)
+
+        # Gate by odometry, then judge by mutual consistency with all loops so far.
+        started = time.perf_counter()
+        changed: dict[Key, None] = {}
+        was_accepted = {key for key, loop in self._loops.items() if loop.accepted}
+        for candidate, result in verified:
+            changed |= dict.fromkeys(self._enter(keyframe, candidate, result))
+        timings_ms["consistency"] = 1e3 * (time.perf_counter() - started)
+
+        # Commit what is accepted, withdraw what no longer is, and solve.
+        started = time.perf_counter()
+        optimised = self._commit([key for key in changed if self._loops[key].accepted != (key in was_accepted)])
+        timings_ms["optimise"] = 1e3 * (time.perf_counter() - started)
+        return StepResult(tuple(self._loops[key] for key in changed), self._map.revision, optimised, timings_ms)
+
+    def finish(self) -> StepResult:
+        """Solve thoroughly; loops that still wait for confirmation keep their verdict UNCONFIRMED, not accepted."""
+        started = time.perf_counter()
+        optimised = self._solver is not None and len(self._map.keyframes) > 0
+        if self._solver is not None and optimised:
+            estimate = self._solver.optimise(thorough=True)
+            with self._lock:
+                self._map.take(estimate)
+        return StepResult((), self._map.revision, optimised, {"optimise": 1e3 * (time.perf_counter() - started)})
+
+    def snapshot(self) -> MapSnapshot:
+        """Return the whole map: all keyframes, and one row per verified loop with its last verdict."""
+        with self._lock:
+            return self._map.snapshot(tuple(self._loops.values()))
+
+    def restore(self, keyframes: Iterable[Keyframe], loops: Iterable[Loop]) -> None:
+        """Take in what a map on disk holds (keyframes in order of id), accepted loops unasked, and solve."""
+        for keyframe in keyframes:
+            self._add(keyframe)
+        accepted = []
+        for loop in loops:
+            with self._lock:
+                self._loops[loop.query_id, loop.match_id] = loop
+            if loop.accepted and (self._solver is None or loop.T_match_query is not None):
+                self._ledger.restore(self._finding_of(loop))
+                accepted.append((loop.query_id, loop.match_id))
+        self._commit(accepted)
+
+    def locate(self, query: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
+        """Say where one image was taken: the verified candidates, localised ones first, then by inliers.
+
+        ``query`` has id -1 and no pose. Safe to call from another thread than ``step``.
+        """
+        with self._lock:
+            known = self._map.keyframes.copy()
+        places = []
+        for candidate in self._islands(candidates, known, None):
+            match = known[candidate.id]
+            result = verify(query, match, self._config.verification, self._pair_seed(query.id, match.id))
+            places.append(self._place(candidate, match, result))
+        return tuple(sorted(places, key=lambda place: (not place.accepted, -place.inliers)))
+
+    def _add(self, keyframe: Keyframe) -> None:
+        """Take the keyframe into memory and, but in mode places, into the graph."""
+        if keyframe.id in self._map.keyframes:
+            raise BackendInputError(f"keyframe {keyframe.id} was given twice")
+        if self._solver is not None:
+            if keyframe.T_odom_cam is None:
+                raise BackendInputError(f"keyframe {keyframe.id} ({keyframe.file}) has no odometry pose")
+            covariance = np.zeros((6, 6)) if keyframe.covariance is None else keyframe.covariance
+            node = Node(
+                keyframe.id,
+                keyframe.session,
+                keyframe.previous_id,
+                keyframe.T_odom_cam,
+                covariance,
+                keyframe.metric,
+            )
+            check_node(node)
+            self._chains.add(node)
+            self._solver.add_keyframe(node)
+        with self._lock:
+            self._map.add(replace(keyframe, jpeg=b"", thumbnail=np.zeros((0, 0), np.uint8)))
+
+    def _verify(self, keyframe: Keyframe, candidates: Candidates) -> list[tuple[Candidate, Verification | Rejected]]:
+        """Compare the keyframe with the best candidate of each island."""
+        return [
+            (
+                candidate,
+                verify(
+                    keyframe,
+                    self._map.keyframes[candidate.id],
+                    self._config.verification,
+                    self._pair_seed(keyframe.id, candidate.id),
+                ),
+            )
+            for candidate in self._islands(candidates, self._map.keyframes, keyframe)
+        ]
+
+    def _islands(
+        self, candidates: Candidates, known: dict[int, Keyframe], keyframe: Keyframe | None
+    ) -> list[Candidate]:
+        """Return the best candidate of each island of neighbouring keyframes; the recent past is none."""
+        config = self._config.verification
+        chosen: list[Candidate] = []
+        for candidate in candidates.ranked:
+            match = known.get(candidate.id)
+            if match is None or (keyframe is not None and match.id == keyframe.id):
+                continue
+            recent = keyframe is not None and keyframe.session == match.session
+            if recent and keyframe is not None and abs(keyframe.id - match.id) < config.min_gap_keyframes:
+                continue
+            near = (
+                abs(other.id - match.id) <= config.island_keyframes and known[other.id].session == match.session
+                for other in chosen
+            )
+            if not any(near):
+                chosen.append(candidate)
+            if len(chosen) == config.candidates:
+                break
+        return chosen
+
+    def _enter(self, keyframe: Keyframe, candidate: Candidate, result: Verification | Rejected) -> list[Key]:
+        """Write the loop's row with its verdict; return the rows that are new or changed."""
+        key = (keyframe.id, candidate.id)
+        loop = Loop(
+            *key, False, Reason.UNCONFIRMED, result.inliers, candidate.score, candidate.votes, candidate.jeffrey
+        )
+        if isinstance(result, Rejected):
+            return self._write(replace(loop, reason=result.reason))
+        if self._solver is not None:
+            if result.T_match_query is None or result.covariance is None or not np.isfinite(result.scale_sigma):
+                return self._write(replace(loop, reason=Reason.BAD_GEOMETRY))
+            loop = replace(loop, T_match_query=result.T_match_query, covariance=result.covariance, scale=result.scale)
+        finding = self._finding_of(loop, result.scale_sigma)
+        if finding.constraint is not None and finding.query_session == finding.match_session:
+            chi2 = gate_chi2(finding.constraint, self._chains)
+            if not chi2 <= self._config.consistency.gate_chi2:
+                return self._write(replace(loop, reason=Reason.ODOMETRY_DISAGREES))
+        keys = self._write(loop)
+        for changed_key, reason in self._ledger.add(finding).items():
+            changed = replace(self._loops[changed_key], accepted=reason == Reason.ACCEPTED, reason=reason)
+            keys += self._write(changed)
+        return keys
+
+    def _write(self, loop: Loop) -> list[Key]:
+        key = (loop.query_id, loop.match_id)
+        with self._lock:
+            self._loops[key] = loop
+        return [key]
+
+    def _finding_of(self, loop: Loop, scale_sigma: float | None = None) -> Finding:
+        query, match = self._map.keyframes[loop.query_id], self._map.keyframes[loop.match_id]
+        constraint = None
+        if loop.T_match_query is not None and loop.covariance is not None:
+            known_scale = query.metric and match.metric
+            if scale_sigma is None:
+                scale_sigma = 1e-3 if known_scale else self._config.graph.unknown_scale_sigma
+            constraint = Constraint(
+                loop.query_id, loop.match_id, loop.T_match_query, loop.covariance, loop.scale, scale_sigma
+            )
+        return Finding(loop.query_id, loop.match_id, query.session, match.session, loop.inliers, constraint)
+
+    def _commit(self, keys: list[Key]) -> bool:
+        """Bring the graph in line with these loops' verdicts; return whether it was solved."""
+        if not keys:
+            return False
+        if self._solver is None:
+            with self._lock:
+                self._map.revision += 1
+            return False
+        for key in keys:
+            constraint = self._ledger.finding(key).constraint
+            if self._loops[key].accepted and constraint is not None:
+                self._solver.add_loop(constraint)
+            else:
+                self._solver.remove_loop(*key)
+        estimate = self._solver.optimise()
+        with self._lock:
+            self._map.take(estimate)
+        return True
+
+    def _place(self, candidate: Candidate, match: Keyframe, result: Verification | Rejected) -> Place:
+        """Say what the comparison of a query image with one keyframe means."""
+        reason, T_map_cam = Reason.ACCEPTED, None
+        if isinstance(result, Rejected):
+            reason = result.reason
+        elif result.inliers < self._config.verification.locate_inliers:
+            reason = Reason.UNCONFIRMED
+        elif result.T_match_query is not None:
+            with self._lock:
+                T_map_cam = self._map.pose_of_neighbour(match.id, result.T_match_query)
+        return Place(
+            keyframe_id=match.id,
+            session=match.session,
+            stamp_ns=match.stamp_ns,
+            file=match.file,
+            score=candidate.score,
+            votes=candidate.votes,
+            jeffrey=candidate.jeffrey,
+            inliers=result.inliers,
+            accepted=reason == Reason.ACCEPTED,
+            reason=reason,
+            T_map_cam=T_map_cam,
+        )
+
+    def _pair_seed(self, query_id: int, match_id: int) -> int:
+        """Return a seed for one pair, so that the result does not depend on what was verified before."""
+        return (self._seed * 1_000_003 + (query_id + 2) * 7_919 + match_id) & 0x7FFFFFFF
