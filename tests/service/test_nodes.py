@@ -1,0 +1,379 @@
+"""The three nodes on a LocalBus: what they send, in which order, and what they do with what goes wrong."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from seamark import SeamarkError
+from seamark.backend.types import Loop, MapSnapshot, Place, Reason
+from seamark.datasets_synth.toy import toy_sequence
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.features import extract_features
+from seamark.frontend.odometry import Frontend, FrontendResult
+from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Mode, Odometry, Outcome, Quality
+from seamark.service import topics
+from seamark.service.bus import LocalBus, RemoteError
+from seamark.service.nodes.backend_node import BackendNode
+from seamark.service.nodes.frontend_node import FrontendNode
+from seamark.service.nodes.vocab_node import VocabNode, observe
+from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery
+from seamark.vocab.place_index import PlaceIndex
+from seamark.vocab.training import train
+from seamark.vocab.types import Candidate, Candidates
+from seamark.vocab.vocabulary import Vocabulary
+
+GREY = np.zeros((4, 6), np.uint8)
+
+
+def keyframe(number: int, session: int = 0) -> Keyframe:
+    return Keyframe(
+        number, session, number, 100 * number, "", Features.empty(), np.zeros((0, 3), np.float32), GREY, b""
+    )
+
+
+def candidates(number: int, *places: int) -> Candidates:
+    return Candidates(number, 100 * number, tuple(Candidate(place, 0.5, 0.5, 0.1) for place in places))
+
+
+@dataclass
+class FakeResult:
+    loops: tuple[Loop, ...] = ()
+    optimised: bool = False
+    timings_ms: dict[str, float] = field(default_factory=lambda: {"verify": 2.0})
+
+
+class FakeSlam:
+    """Accepts the first candidate of every keyframe; fails at keyframe 13."""
+
+    def __init__(self) -> None:
+        self.steps: list[tuple[int, tuple[int, ...]]] = []
+        self.finished = 0
+
+    def step(self, keyframe: Keyframe, candidates: Candidates) -> FakeResult:
+        if keyframe.id == 13:
+            raise SeamarkError("thirteen")
+        assert keyframe.id == candidates.query_id
+        self.steps.append((keyframe.id, tuple(candidate.id for candidate in candidates.ranked)))
+        loops = tuple(
+            Loop(keyframe.id, one.id, True, Reason.ACCEPTED, 40, 0.5, 0.5, 0.1) for one in candidates.ranked[:1]
+        )
+        return FakeResult(loops, optimised=bool(loops))
+
+    def finish(self) -> FakeResult:
+        self.finished += 1
+        return FakeResult(optimised=True, timings_ms={})
+
+    def snapshot(self) -> MapSnapshot:
+        ids = np.array([number for number, _ in self.steps], np.int64)
+        return MapSnapshot(len(ids), ids, ids * 0, ids * 0, np.zeros((len(ids), 4, 4)), np.ones(len(ids)), ())
+
+    def locate(self, keyframe: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
+        self.camera = keyframe.camera
+        return tuple(
+            Place(one.id, 0, 0, "", one.score, one.votes, one.jeffrey, 0, False, Reason.FEW_INLIERS)
+            for one in candidates.ranked
+        )
+
+
+class FakeStore:
+    def __init__(self) -> None:
+        self.log: list[tuple[str, int]] = []
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        if keyframe.id == 77:
+            raise SeamarkError("the disk is full")
+        self.log.append(("keyframe", keyframe.id))
+
+    def add_loop(self, loop: Loop) -> None:
+        self.log.append(("loop", loop.query_id))
+
+    def update_poses(self, snapshot: MapSnapshot) -> None:
+        self.log.append(("poses", len(snapshot.keyframe_ids)))
+
+    def close(self) -> None:
+        self.log.append(("close", 0))
+
+
+class Backend:
+    """A BackendNode between fakes, and who sends to it."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.bus = LocalBus()
+        self.slam, self.store = FakeSlam(), FakeStore()
+        self.node = BackendNode(self.bus.for_node("backend"), self.slam, self.store, FrontendConfig(), **settings)
+        self.bus.for_node("vocab").handle(topics.KEYFRAME, lambda _: None)
+
+    def send(self, *messages: Keyframe | Candidates) -> None:
+        for message in messages:
+            self.bus.send(topics.KEYFRAME if isinstance(message, Keyframe) else topics.CANDIDATES, message)
+            self.bus.drain()
+
+    def counters(self) -> dict[str, int]:
+        counters: dict[str, int] = self.bus.request(topics.STATUS["backend"], Empty()).counters
+        return counters
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        [keyframe(0), candidates(0), keyframe(1), candidates(1, 0), keyframe(2), candidates(2, 0, 1)],
+        [keyframe(0), keyframe(1), keyframe(2), candidates(0), candidates(1, 0), candidates(2, 0, 1)],
+        [candidates(0), candidates(1, 0), candidates(2, 0, 1), keyframe(0), keyframe(1), keyframe(2)],
+        [candidates(0), keyframe(0), keyframe(1), candidates(1, 0), candidates(2, 0, 1), keyframe(2)],
+    ],
+)
+def test_keyframes_meet_their_candidates_in_any_order_of_arrival(order: list[Keyframe | Candidates]) -> None:
+    backend = Backend()
+    loops: list[Loop] = []
+    maps: list[MapSnapshot] = []
+    backend.bus.subscribe(topics.LOOP, loops.append)
+    backend.bus.subscribe(topics.MAP, maps.append)
+    backend.send(*order)
+    assert backend.slam.steps == [(0, ()), (1, (0,)), (2, (0, 1))]
+    assert [(loop.query_id, loop.match_id) for loop in loops] == [(1, 0), (2, 0)]
+    assert [len(one.keyframe_ids) for one in maps] == [2, 3]
+    assert [entry for entry in backend.store.log if entry[0] == "keyframe"] == [("keyframe", n) for n in range(3)]
+    counters = backend.counters()
+    assert counters["keyframes"] == 3 and counters["loops_accepted"] == 2 and counters["next_keyframe_id"] == 3
+
+
+def test_repeats_are_acknowledged_and_forgotten() -> None:
+    backend = Backend()
+    backend.send(keyframe(0), keyframe(0), candidates(0), candidates(0), keyframe(0), candidates(0))
+    assert backend.slam.steps == [(0, ())]
+    counters = backend.counters()
+    assert counters["keyframes_again"] == 2 and counters["candidates_again"] == 2
+    restarted = Backend(known_ids=[0, 1])
+    restarted.send(keyframe(1), candidates(1), keyframe(2), candidates(2))
+    assert restarted.slam.steps == [(2, ())]
+
+
+def test_a_keyframe_that_the_vocabulary_refused_is_mapped_without_candidates() -> None:
+    backend = Backend()
+    backend.send(keyframe(0), candidates(0), keyframe(1), keyframe(2), candidates(2, 0))
+    assert backend.slam.steps == [(0, ()), (1, ()), (2, (0,))]
+    assert backend.counters()["candidates_missing"] == 1
+
+
+def test_without_loops_candidates_are_ignored() -> None:
+    backend = Backend(no_loops=True)
+    backend.send(keyframe(0), keyframe(1), candidates(0), candidates(1, 0), candidates(2, 0), keyframe(2))
+    assert backend.slam.steps == [(0, ()), (1, ()), (2, ())]
+
+
+def test_a_failure_is_told_and_the_next_keyframes_are_mapped() -> None:
+    backend = Backend()
+    with pytest.raises(RemoteError, match="thirteen"):
+        backend.send(keyframe(13), candidates(13))
+    with pytest.raises(RemoteError, match="the disk is full"):
+        backend.send(keyframe(77))
+    backend.bus.drain()
+    backend.send(keyframe(78), candidates(78))
+    assert backend.slam.steps == [(78, ())]
+
+
+def test_draining_maps_what_waits_and_writes_the_poses() -> None:
+    backend = Backend()
+    backend.send(keyframe(0), keyframe(1))
+    assert backend.slam.steps == []
+    assert backend.bus.request(topics.DRAIN["backend"], Empty()) == Done("backend")
+    assert backend.slam.steps == [(0, ()), (1, ())] and backend.slam.finished == 1
+    assert backend.store.log[-1] == ("poses", 2)
+    assert len(backend.bus.request(topics.MAP_SNAPSHOT, Empty()).keyframe_ids) == 2
+    backend.node.close()
+    assert backend.store.log[-1] == ("close", 0)
+
+
+class FakeFrontend:
+    """Every frame is tracked and two in three become keyframes, one step late."""
+
+    def __init__(self) -> None:
+        self._late: list[Keyframe] = []
+        self._next = 0
+        self.closed = False
+
+    def step(self, frame: Frame) -> FrontendResult:
+        ready, self._late = tuple(self._late), []
+        number = None
+        if frame.index % 3:
+            number, self._next = self._next, self._next + 1
+            self._late = [replace(keyframe(number), previous_id=number - 1 if number else None)]
+        filled = (Filled(0, 0, 0, 0, np.eye(4)),)
+        odometry = Odometry(
+            frame.index,
+            frame.stamp_ns,
+            frame.file,
+            0 if frame.index else -1,
+            Quality.GOOD,
+            Outcome.TRACKED,
+            reference_id=number,
+            keyframe_id=number,
+            filled=filled,
+            stages_ms={"track": 1.0},
+        )
+        return FrontendResult(odometry, ready)
+
+    def finish(self) -> tuple[Keyframe, ...]:
+        ready, self._late = tuple(self._late), []
+        return ready
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def png(image: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(".png", image)[1])
+
+
+def run_frontend(frames: Sequence[Frame | EncodedFrame], **settings: int) -> tuple[list[Odometry], list[Keyframe], Any]:
+    bus, keyframes = LocalBus(), []
+    fake = FakeFrontend()
+    node = FrontendNode(bus.for_node("frontend"), fake, **settings)  # type: ignore[arg-type]
+    for reader in ("vocab", "backend"):
+        bus.for_node(reader).handle(topics.KEYFRAME, keyframes.append if reader == "vocab" else lambda _: None)
+    published: list[Odometry] = []
+    bus.subscribe(topics.ODOMETRY, published.append)
+    odometry = [bus.request(topics.FRAME, frame) for frame in frames]
+    assert bus.request(topics.DRAIN["frontend"], Empty()) == Done("frontend")
+    assert [one.index for one in published] == [one.index for one in odometry]
+    status = bus.request(topics.STATUS["frontend"], Empty())
+    node.close()
+    assert fake.closed
+    return odometry, keyframes, status
+
+
+def test_frames_are_answered_and_late_keyframes_sent() -> None:
+    odometry, keyframes, status = run_frontend([Frame(index, index, GREY) for index in range(6)])
+    assert [one.keyframe_id for one in odometry] == [None, 0, 1, None, 2, 3]
+    assert [one.id for one in keyframes] == [0, 1, 2, 3]
+    assert status.counters == {"frames": 6, "frames_tracked": 6, "keyframes": 4}
+    assert status.stages_ms["track"] == [1.0] * 6 and len(status.stages_ms["frame"]) == 6
+    assert status.node == "frontend" and 20e6 < status.rss_bytes <= status.peak_rss_bytes < 20e9 and status.cpu_s > 0
+
+
+def test_a_restarted_front_end_goes_on_counting() -> None:
+    odometry, keyframes, _ = run_frontend(
+        [Frame(index, index, GREY) for index in range(3)], first_keyframe_id=40, first_session=2
+    )
+    assert [one.keyframe_id for one in odometry] == [None, 40, 41]
+    assert [one.reference_id for one in odometry] == [None, 40, 41]
+    assert [one.session for one in odometry] == [-1, 2, 2]
+    assert odometry[1].filled[0].reference_id == 40 and odometry[1].filled[0].session == 2
+    assert [(one.id, one.previous_id, one.session) for one in keyframes] == [(40, None, 2), (41, 40, 2)]
+
+
+def test_encoded_frames_are_decoded_and_broken_ones_reported() -> None:
+    colour = np.arange(72, dtype=np.uint8).reshape(4, 6, 3)
+    depth = np.arange(24, dtype=np.uint16).reshape(4, 6)
+    seen: list[Frame] = []
+    bus = LocalBus()
+    fake = FakeFrontend()
+    step = fake.step
+    fake.step = lambda frame: (seen.append(frame), step(frame))[1]  # type: ignore[method-assign, func-returns-value]
+    FrontendNode(bus.for_node("frontend"), fake)  # type: ignore[arg-type]
+    whole = EncodedFrame(0, 5, png(colour), png(GREY), png(depth), "a.png")
+    assert bus.request(topics.FRAME, whole).outcome is Outcome.TRACKED
+    np.testing.assert_array_equal(seen[0].image, colour)
+    np.testing.assert_array_equal(seen[0].image_right, GREY)
+    np.testing.assert_array_equal(seen[0].depth, depth)
+    for broken in (
+        EncodedFrame(1, 6, b"", file="b.png"),
+        EncodedFrame(1, 6, png(colour)[:-20]),
+        EncodedFrame(1, 6, png(GREY), None, png(colour)),
+        EncodedFrame(1, 6, png(GREY), b"no image"),
+    ):
+        odometry = bus.request(topics.FRAME, broken)
+        assert (odometry.index, odometry.stamp_ns, odometry.file) == (1, 6, broken.file)
+        assert odometry.outcome is Outcome.UNREADABLE and odometry.quality is Quality.LOST and odometry.session == -1
+    assert len(seen) == 1
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return list(toy_sequence("line", 24, seed=3).frames())
+
+
+@pytest.fixture(scope="module")
+def vocabulary(frames: list[Frame]) -> Vocabulary:
+    other = toy_sequence("turn", 6, seed=9).frames()
+    return train((extract_features(frame.image, 200).descriptors for frame in other), 64, 0)
+
+
+def run_all(frames: list[Frame], vocabulary: Vocabulary) -> tuple[LocalBus, FakeSlam, list[Odometry]]:
+    bus, slam = LocalBus(), FakeSlam()
+    config = FrontendConfig(keyframe_max_gap_s=0.2)
+    rig = toy_sequence("line", 24, seed=3).rig
+    frontend = FrontendNode(bus.for_node("frontend"), Frontend(rig, Mode.RGBD, config))
+    VocabNode(bus.for_node("vocab"), PlaceIndex(vocabulary))
+    BackendNode(bus.for_node("backend"), slam, None, config, rig.cam0 if rig else None)
+    odometry = []
+    for frame in frames:
+        odometry.append(bus.request(topics.FRAME, frame))
+        bus.pump()
+    for node in topics.NODES:
+        bus.request(topics.DRAIN[node], Empty())
+    frontend.close()
+    return bus, slam, odometry
+
+
+def test_three_nodes_map_a_toy_world_the_same_twice(frames: list[Frame], vocabulary: Vocabulary) -> None:
+    _, slam, odometry = run_all(frames, vocabulary)
+    _, again, odometry_again = run_all(frames, vocabulary)
+    ids = [number for number, _ in slam.steps]
+    assert ids == list(range(len(ids))) and 3 <= len(ids) < len(frames)
+    assert slam.steps == again.steps
+    for one, other in zip(odometry, odometry_again, strict=True):
+        assert one.outcome in (Outcome.TRACKED, Outcome.NEW_SESSION)
+        np.testing.assert_array_equal(one.T_odom_cam, other.T_odom_cam)
+
+
+def test_place_queries_are_ranked_and_located(frames: list[Frame], vocabulary: Vocabulary) -> None:
+    bus, slam, _ = run_all(frames, vocabulary)
+    reply = bus.request(topics.PLACE, PlaceQuery(png(frames[-1].image), top_k=2))
+    assert reply.error_code is None and len(reply.places) == 2
+    assert reply.places[0].keyframe_id >= slam.steps[-1][0] - 1  # the last keyframes look most like the last frame
+    assert set(reply.timings_ms) == {"decode", "features", "rank", "locate"}
+    assert slam.camera == toy_sequence("line", 24, seed=3).rig.cam0  # type: ignore[union-attr]
+    counters = bus.request(topics.STATUS["vocab"], Empty()).counters
+    assert counters["places"] == len(slam.steps)
+
+
+@pytest.mark.parametrize(
+    "query, code",
+    [
+        (PlaceQuery(b"no image"), PlaceError.UNDECODABLE_IMAGE),
+        (PlaceQuery(b""), PlaceError.UNDECODABLE_IMAGE),
+        (PlaceQuery(png(np.full((60, 80), 128, np.uint8))), PlaceError.NO_FEATURES),
+        (PlaceQuery(png(GREY), camera=Camera(60, 40, 50, 50, 30, 20)), PlaceError.BAD_REQUEST),
+    ],
+)
+def test_bad_place_queries_have_typed_answers(query: PlaceQuery, code: PlaceError, vocabulary: Vocabulary) -> None:
+    bus = LocalBus()
+    VocabNode(bus.for_node("vocab"), PlaceIndex(vocabulary))
+    BackendNode(bus.for_node("backend"), FakeSlam(), None, FrontendConfig())
+    reply = bus.request(topics.PLACE, query)
+    assert reply.error_code is code and reply.error_message and reply.places == ()
+
+
+def test_an_empty_map_is_told_from_an_unknown_place(frames: list[Frame], vocabulary: Vocabulary) -> None:
+    bus = LocalBus()
+    VocabNode(bus.for_node("vocab"), PlaceIndex(vocabulary))
+    BackendNode(bus.for_node("backend"), FakeSlam(), None, FrontendConfig())
+    assert bus.request(topics.PLACE, PlaceQuery(png(frames[0].image))).error_code is PlaceError.EMPTY_MAP
+
+
+def test_a_keyframe_sent_again_is_ranked_and_not_added_again(vocabulary: Vocabulary) -> None:
+    bus, ranked = LocalBus(), []
+    bus.for_node("backend").handle(topics.KEYFRAME, lambda _: None)
+    bus.for_node("backend").handle(topics.CANDIDATES, lambda c: ranked.append(c.query_id))
+    VocabNode(bus.for_node("vocab"), PlaceIndex(vocabulary), [observe(keyframe(0))])
+    for number in (1, 1, 0):
+        bus.send(topics.KEYFRAME, keyframe(number))
+        bus.drain()
+    assert ranked == [1, 1, 0]
+    counters = bus.request(topics.STATUS["vocab"], Empty()).counters
+    assert counters == {"places": 2, "keyframes": 1, "keyframes_again": 2}
