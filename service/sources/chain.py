@@ -31,7 +31,7 @@ class ChainSource:
     @property
     def name(self) -> str:
         """Return the names of all parts."""
-        return "+".join(part.name for part in self.parts)
+        return " + ".join(part.name for part in self.parts)
 
     @property
     def n_frames(self) -> int | None:

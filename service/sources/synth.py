@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from seamark.frontend.camera import Rig
 from seamark.frontend.types import Frame, Mode
-from seamark.service.sources.base import SourceError, Unreadable, choose
+from seamark.service.sources.base import SourceError, Unreadable, ahead, choose
 from seamark.service.stamps import NANOSECONDS
 from seamark.service.types import Trajectory
 
@@ -53,21 +53,31 @@ class SynthSource:
         return int(np.median(np.diff(stamps))) if len(stamps) > 1 else NANOSECONDS
 
     def frames(self) -> Iterator[Frame | Unreadable]:
-        """Yield all frames in order."""
-        for frame in self.sequence.frames():
-            depth = frame.depth if self.mode is Mode.RGBD else None
-            right = frame.image_right if self.mode is Mode.STEREO else None
-            yield Frame(frame.index, frame.stamp_ns, frame.image, right, depth, frame.file)
+        """Yield all frames in order, made ahead in one thread; closing the iterator ends a rendering."""
+        made = self.sequence.frames()
+        try:
+            for frame in ahead(lambda _: next(made, None), range(self.n_frames)):
+                if frame is None:
+                    return
+                yield self._seen(frame)
+        finally:
+            made.close()
+
+    def _seen(self, frame: Frame) -> Frame:
+        depth = frame.depth if self.mode is Mode.RGBD else None
+        right = frame.image_right if self.mode is Mode.STEREO else None
+        return Frame(frame.index, frame.stamp_ns, frame.image, right, depth, frame.file)
 
 
 def open_synth_source(spec: str, *, mode: Mode | None) -> SynthSource:
     """Open ``synth:NAME[,key=value...]``; raises SourceError for an unknown one, SeamarkError where nothing renders."""
-    if not spec.removeprefix(PREFIX):
+    name = spec.removeprefix(PREFIX)
+    if not name:
         raise SourceError(f"{spec!r} names no world; write synth:NAME")
     # Imported here, because nothing else of the service needs a simulator.
     from seamark.datasets_synth.scenario import open_synth
 
-    sequence = open_synth(spec)
+    sequence = open_synth(name)
     truth = Trajectory(
         np.asarray(sequence.ground_truth.stamps_ns, np.int64), np.asarray(sequence.ground_truth.T_world_cam, np.float64)
     )

@@ -1,3 +1,4 @@
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -5,7 +6,8 @@ import numpy as np
 import pytest
 
 from seamark import SeamarkError
-from seamark.frontend.camera import CalibrationError
+from seamark.datasets_synth.sequence import GroundTruth, SynthSequence
+from seamark.frontend.camera import CalibrationError, Camera, Rig
 from seamark.frontend.types import Frame, Mode
 from seamark.service.sources.base import Source, SourceError, Unreadable
 from seamark.service.sources.decode import UnreadableImageError, jpeg_complete, read_depth, read_image
@@ -352,6 +354,47 @@ class TestVideo:
         (tmp_path / "x.mp4").write_bytes(b"nothing")
         with pytest.raises(SourceError, match="cannot be read as a video"):
             open_sources([str(tmp_path / "x.mp4")])
+
+
+class TestWorlds:
+    def sequence(self, mode: Mode, closed: list[bool]) -> SynthSequence:
+        def make() -> Iterator[Frame]:
+            try:
+                for k in range(4):
+                    right = picture(k) if mode is Mode.STEREO else None
+                    depth = np.ones((24, 32), np.uint16) if mode is Mode.RGBD else None
+                    yield Frame(k, k * 50_000_000, picture(k), right, depth, f"rgb/{k}.jpg")
+            finally:
+                closed.append(True)
+
+        truth = GroundTruth(np.arange(4, dtype=np.int64) * 50_000_000, np.tile(np.eye(4), (4, 1, 1)))
+        return SynthSequence("loop", Rig(Camera(32, 24, 30, 30, 16, 12)), mode, 4, truth, make)
+
+    def test_the_simulator_only_sees_the_name(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        asked: list[str] = []
+        closed: list[bool] = []
+
+        def open_synth(spec: str) -> SynthSequence:
+            asked.append(spec)
+            return self.sequence(Mode.RGBD, closed)
+
+        monkeypatch.setattr("seamark.datasets_synth.scenario.open_synth", open_synth)
+        source = open_sources(["synth:loop,seed=3"])
+        assert asked == ["loop,seed=3"]
+        assert (source.name, source.mode, source.n_frames, source.period_ns) == ("loop", Mode.RGBD, 4, 50_000_000)
+        assert source.modes == (Mode.RGBD, Mode.MONO, Mode.PLACES)
+        assert source.ground_truth is not None
+        got = frames(source)
+        assert [frame.stamp_ns for frame in got] == [0, 50_000_000, 100_000_000, 150_000_000]
+        assert isinstance(got[0], Frame)
+        assert got[0].depth is not None
+        mono = open_sources(["synth:loop"], mode="mono").frames()
+        first = next(mono)
+        assert isinstance(first, Frame)
+        assert first.depth is None
+        closed.clear()
+        mono.close()  # type: ignore[attr-defined]
+        assert closed == [True]
 
 
 class TestWhatCannotBeOpened:
