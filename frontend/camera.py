@@ -57,7 +57,7 @@ class Camera:
         if not self.distorted or len(points64) == 0:
             return points64
         coefficients = np.array(self.distortion, np.float64)
-        return cv2.undistortPoints(points64, self.K, coefficients, P=self.K).reshape(-1, 2)  # type: ignore[no-any-return]
+        return cv2.undistortPoints(points64, self.K, coefficients, P=self.K).reshape(-1, 2)
 
     def rays(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map pixels (N, 2) as seen to rays (N, 3) with z = 1 in the camera frame."""
@@ -80,7 +80,7 @@ class Camera:
         if len(points64) == 0:
             return np.zeros((0, 2))
         zero = np.zeros(3)
-        return cv2.projectPoints(points64, zero, zero, self.K, np.array(self.distortion))[0].reshape(-1, 2)  # type: ignore[no-any-return]
+        return cv2.projectPoints(points64, zero, zero, self.K, np.array(self.distortion))[0].reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False)

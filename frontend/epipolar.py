@@ -37,10 +37,10 @@ def refine_along(
 
     def patches(image: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.float32]:
         x, y = np.ascontiguousarray(centres[:, :1] + dx), np.ascontiguousarray(centres[:, 1:] + dy)
-        return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[no-any-return]
+        return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def centred(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return values - (values @ window)[:, None]  # type: ignore[no-any-return]
+        return values - (values @ window)[:, None]
 
     right32 = right.astype(np.float32)
     gradient_x = cv2.Scharr(right32, cv2.CV_32F, 1, 0, scale=1 / 32)

@@ -157,7 +157,8 @@ def refine_pose(
     T_odom_cam: NDArray[np.float64], observations: Observations, camera: Camera, *, pixel_sigma: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Minimise robust pixel and inverse-depth errors over the pose; return it with its covariance (6, 6)."""
-    T, H = T_odom_cam, np.eye(6)
+    T = T_odom_cam
+    H: NDArray[np.float64] = np.eye(6)
     for _ in range(ITERATIONS):
         in_cam = se3.transform(se3.inverse(T), observations.landmarks)
         in_cam[:, 2] = np.maximum(in_cam[:, 2], 1e-3)
@@ -165,13 +166,13 @@ def refine_pose(
         J = J_point @ pose_jacobian(in_cam)
         weights = robust_weights(residuals)
         Jw = (J * weights[:, :, None]).reshape(-1, 6)
-        H = Jw.T @ J.reshape(-1, 6) + 1e-9 * np.eye(6)
-        delta = -np.linalg.solve(H, Jw.T @ residuals.reshape(-1))
+        H = np.asarray(Jw.T @ J.reshape(-1, 6) + 1e-9 * np.eye(6), np.float64)
+        delta = np.asarray(-np.linalg.solve(H, Jw.T @ residuals.reshape(-1)), np.float64)
         T = retract(T, delta)
         if float(delta @ delta) < CONVERGED**2:
             break
     spread = float(np.median(np.linalg.norm(residuals[:, :2], axis=1))) / 1.1774  # sigma of a Rayleigh median
-    return se3.orthonormalise(T), np.linalg.inv(H) * max(1.0, spread) ** 2
+    return se3.orthonormalise(T), np.asarray(np.linalg.inv(H) * max(1.0, spread) ** 2, np.float64)
 
 
 def motion_covariance(

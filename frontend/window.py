@@ -132,9 +132,9 @@ def _solve(
     H_ll[:, diagonal, diagonal] += 1e-9
     inverse_ll = np.linalg.inv(H_ll)
 
-    W = np.zeros((n_landmarks, n_poses, 6, 3))
-    W[problem.landmark_of, problem.keyframe_of] = np.swapaxes(at.J_pose, 1, 2) @ at.J_landmark
-    W = W.reshape(n_landmarks, n_poses * 6, 3)
+    blocks = np.zeros((n_landmarks, n_poses, 6, 3))
+    blocks[problem.landmark_of, problem.keyframe_of] = np.swapaxes(at.J_pose, 1, 2) @ at.J_landmark
+    W = blocks.reshape(n_landmarks, n_poses * 6, 3)
     WH = W @ inverse_ll
     flat = W.transpose(1, 0, 2).reshape(n_poses * 6, -1)
     S = -(WH.transpose(1, 0, 2).reshape(n_poses * 6, -1) @ flat.T)

@@ -1,0 +1,263 @@
+"""`seamark run`: a source through the three nodes, from the first frame to the written results."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from seamark.backend.map_store import MapStore
+from seamark.backend.types import MapSnapshot
+from seamark.frontend.types import Frame, Mode, Odometry, Outcome, Quality
+from seamark.service import topics
+from seamark.service.bus import Bus, UnavailableError
+from seamark.service.config import SeamarkConfig
+from seamark.service.launcher import Launcher
+from seamark.service.local_nodes import LocalNodes, own_usage
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.output import Output, prepare_output
+from seamark.service.recorder import NullRecorder, Recorder, RerunRecorder
+from seamark.service.requests import Empty, Status
+from seamark.service.results import write_files
+from seamark.service.sources.base import Source, SourceError, Unreadable
+from seamark.service.types import KeyframeSummary, RunRecord
+
+MAP_FILE = "map.seamark"
+RECORDING_FILE = "run.rrd"
+DRAIN_TIMEOUT_S = 600.0
+
+Progress = Callable[[int, int | None, Odometry], None]
+Nodes = Launcher | LocalNodes
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run is asked for, besides its source and the configuration.
+
+    ``in_process`` puts the nodes on a LocalBus, so that two runs give equal trajectories and tables. ``realtime`` sends
+    frames no faster than their stamps say. ``vocabulary`` None is the one that ships with Seamark. ``sources`` are
+    named in the report.
+    """
+
+    out: Path
+    sources: tuple[str, ...]
+    vocabulary: Path | None = None
+    loops: bool = True
+    in_process: bool = False
+    realtime: bool = False
+
+
+class FrameWindow:
+    """Frames on their way: at most ``size`` unacknowledged, answered in order, sent again when the front end died."""
+
+    def __init__(self, nodes: Nodes, size: int) -> None:
+        self._nodes, self._size = nodes, size
+        self._pending: deque[tuple[Frame | Unreadable, Future[Odometry] | None]] = deque()
+
+    def push(self, frame: Frame | Unreadable) -> Iterator[tuple[Frame | Unreadable, Odometry]]:
+        """Send a frame and yield those that had to be answered first."""
+        while len(self._pending) >= self._size:
+            yield self._pop()
+        self._pending.append((frame, self._send(frame)))
+
+    def drain(self) -> Iterator[tuple[Frame | Unreadable, Odometry]]:
+        """Yield the rest."""
+        while self._pending:
+            yield self._pop()
+
+    def _send(self, frame: Frame | Unreadable) -> "Future[Odometry] | None":
+        if isinstance(frame, Unreadable):
+            return None
+        bus: Bus = self._nodes.bus
+        future = bus.request_async(topics.FRAME, frame)
+        if isinstance(self._nodes, LocalNodes):
+            self._nodes.bus.pump()
+        return future
+
+    def _pop(self) -> tuple[Frame | Unreadable, Odometry]:
+        while True:
+            frame, future = self._pending[0]
+            if future is None:
+                assert isinstance(frame, Unreadable)
+                odometry = Odometry(frame.index, frame.stamp_ns, frame.file, -1, Quality.LOST, Outcome.UNREADABLE)
+                break
+            try:
+                odometry = future.result()
+                break
+            except UnavailableError:
+                self._nodes.check()
+                self._nodes.wait_until_alive()
+                self._pending = deque((waiting, self._send(waiting)) for waiting, _ in self._pending)
+        self._pending.popleft()
+        return frame, odometry
+
+
+def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Progress | None = None) -> RunRecord:
+    """Run a source through the nodes and write all results; returns what was found.
+
+    Nothing appears in the folder unless the run ends well. Raises a SeamarkError for bad input, a bad configuration or
+    a folder that cannot be written to.
+    """
+    with prepare_output(options.out) as output:
+        settings = NodeSettings(
+            mode=source.mode,
+            rig=source.rig,
+            config=for_mode(config, source.mode),
+            vocabulary=options.vocabulary,
+            map_path=output.staging / MAP_FILE,
+            no_loops=not options.loops,
+            solver_process=not options.in_process,
+        )
+        record = _run_nodes(source, options, settings, output, progress)
+        write_files(record, output.staging, settings.config)
+        output.commit()
+    return record
+
+
+def for_mode(config: SeamarkConfig, mode: Mode) -> SeamarkConfig:
+    """Return the configuration as the mode needs it: without motion, the recent past is excluded by count."""
+    if mode is not Mode.PLACES:
+        return config
+    vocab = config.vocab.model_copy(
+        update={"exclude_recent_s": 0.0, "exclude_recent_count": config.vocab.exclude_recent_count_places}
+    )
+    return config.model_copy(update={"vocab": vocab})
+
+
+def _run_nodes(
+    source: Source, options: RunOptions, settings: NodeSettings, output: Output, progress: Progress | None
+) -> RunRecord:
+    with ExitStack() as stack:
+        recorder = _recorder(source, settings.config, output)
+        stack.callback(recorder.close)
+        nodes = _start(settings, in_process=options.in_process)
+        stack.enter_context(nodes)
+        started = time.monotonic()
+        odometry = _send_all(source, nodes, options, settings.config, recorder, progress)
+        for node in topics.NODES:
+            nodes.bus.request(topics.DRAIN[node], Empty(), DRAIN_TIMEOUT_S)
+        wall_s = time.monotonic() - started
+        snapshot: MapSnapshot = nodes.bus.request(topics.MAP_SNAPSHOT, Empty())
+        stages_ms = _stages(nodes)
+        usage = nodes.stop()
+
+        record = RunRecord(
+            sources=options.sources,
+            mode=source.mode,
+            odometry=odometry,
+            keyframes=_keyframes(output.staging / MAP_FILE, recorder),
+            snapshot=snapshot,
+            ground_truth=source.ground_truth,
+            processes=(*usage, own_usage()),
+            wall_s=wall_s,
+            stages_ms=stages_ms,
+            deterministic=options.in_process,
+        )
+        recorder.finish(record)
+    return record
+
+
+def _start(settings: NodeSettings, *, in_process: bool) -> Nodes:
+    return LocalNodes(settings) if in_process else Launcher(settings)
+
+
+def _recorder(source: Source, config: SeamarkConfig, output: Output) -> Recorder:
+    if not config.service.record:
+        return NullRecorder()
+    return RerunRecorder(
+        output.staging / RECORDING_FILE,
+        name=source.name,
+        mode=source.mode,
+        rig=source.rig,
+        image_px=config.service.recording_image_px,
+        jpeg_quality=config.service.recording_jpeg_quality,
+    )
+
+
+def _send_all(
+    source: Source,
+    nodes: Nodes,
+    options: RunOptions,
+    config: SeamarkConfig,
+    recorder: Recorder,
+    progress: Progress | None,
+) -> tuple[Odometry, ...]:
+    """Send every frame and return what the front end said of each."""
+    window = FrameWindow(nodes, config.service.frame_window)
+    answered: list[Odometry] = []
+
+    def take(pairs: Iterator[tuple[Frame | Unreadable, Odometry]]) -> None:
+        for frame, odometry in pairs:
+            answered.append(odometry)
+            recorder.frame(frame, odometry)
+            if progress is not None:
+                progress(len(answered), source.n_frames, odometry)
+
+    checked = False
+    pace = Pace() if options.realtime else None
+    for frame in source.frames():
+        if isinstance(frame, Frame) and not checked:
+            check_size(frame, source)
+            checked = True
+        if pace is not None:
+            pace.wait(frame.stamp_ns)
+        take(window.push(frame))
+    take(window.drain())
+    if not checked:
+        raise SourceError(f"{source.name}: not one of {len(answered)} images can be read")
+    return tuple(answered)
+
+
+def check_size(frame: Frame, source: Source) -> None:
+    """Raise SourceError if the first image contradicts the calibration; later ones are counted frame by frame."""
+    if source.rig is None or source.mode is Mode.PLACES:
+        return
+    camera, (height, width) = source.rig.cam0, frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise SourceError(
+            f"{source.name}: {frame.file} has {width} x {height} pixels,"
+            f" but the calibration is for {camera.width} x {camera.height}"
+        )
+
+
+class Pace:
+    """Holds frames back until as much time has passed as between their stamps."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def wait(self, stamp_ns: int) -> None:
+        """Sleep until the frame with this stamp is due."""
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now, stamp_ns
+        due = self._first[0] + 1e-9 * (stamp_ns - self._first[1])
+        if due > now:
+            time.sleep(due - now)
+
+
+def _stages(nodes: Nodes) -> dict[str, list[float]]:
+    stages: dict[str, list[float]] = {}
+    for node in topics.NODES:
+        status: Status = nodes.bus.request(topics.STATUS[node], Empty())
+        for stage, latencies in status.stages_ms.items():
+            stages[f"{node}.{stage}"] = latencies
+    return stages
+
+
+def _keyframes(map_path: Path, recorder: Recorder) -> tuple[KeyframeSummary, ...]:
+    """Read the keyframes back from the finished map, and show them to the recorder."""
+    summaries = []
+    store: Any = MapStore(map_path)
+    try:
+        for keyframe in store.load_keyframes():
+            recorder.keyframe(keyframe)
+            summaries.append(
+                KeyframeSummary(keyframe.id, keyframe.session, keyframe.index, keyframe.stamp_ns, keyframe.file)
+            )
+    finally:
+        store.close()
+    return tuple(summaries)

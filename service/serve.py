@@ -1,0 +1,74 @@
+"""`seamark serve`: keeps the three nodes alive until it is told to stop."""
+
+import logging
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from seamark.frontend.types import Mode
+from seamark.service.calibration import load_calibration
+from seamark.service.config import SeamarkConfig
+from seamark.service.launcher import Launcher
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.run import for_mode
+from seamark.service.sources.base import SourceError, choose, offered
+
+CHECK_EVERY_S = 0.5
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """What the service is asked for besides the configuration.
+
+    ``calib`` None allows mode places only. ``listen`` is where the own router listens; ``connect``, if given, is the
+    router to use instead.
+    """
+
+    calib: Path | None
+    mode: str | None
+    map_path: Path
+    vocabulary: Path | None
+    listen: str
+    connect: str | None
+    namespace: str
+    loops: bool = True
+
+
+def settings_for(options: ServeOptions, config: SeamarkConfig) -> NodeSettings:
+    """Return what the nodes are told; raises SeamarkError for a bad calibration or mode."""
+    rig = load_calibration(options.calib) if options.calib is not None else None
+    modes = offered(rig, stereo=rig is not None and rig.cam1 is not None, depth=rig is not None)
+    if options.mode is not None and options.mode not in list(Mode):
+        raise SourceError(f"{options.mode!r} is not a mode; there are {', '.join(Mode)}")
+    mode = choose(Mode(options.mode) if options.mode else None, modes, "the service")
+    return NodeSettings(
+        mode=mode,
+        rig=rig,
+        config=for_mode(config, mode),
+        vocabulary=options.vocabulary,
+        map_path=options.map_path,
+        no_loops=not options.loops,
+        endpoint=options.connect or "",
+        namespace=options.namespace,
+    )
+
+
+def serve(options: ServeOptions, config: SeamarkConfig, ready: Callable[[str, str], None]) -> None:
+    """Start the nodes, call ``ready(endpoint, mode)``, wait for SIGINT or SIGTERM, and stop the nodes in order.
+
+    Raises NodeFailedError when a node dies more often than it is restarted, SessionError when the endpoint cannot be
+    used, and SeamarkError for bad settings.
+    """
+    settings = settings_for(options, config)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with Launcher(settings, listen=options.listen) as launcher:
+        ready(launcher.endpoint, settings.mode)
+        while not stop.wait(CHECK_EVERY_S):
+            launcher.check()
+        logger.info("stopping")
