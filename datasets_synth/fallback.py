@@ -5,17 +5,22 @@ import shutil
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from seamark import SeamarkError
 from seamark.datasets_synth import folder, sensor, specification, trajectory
 from seamark.datasets_synth.rendering import RenderPool
 from seamark.datasets_synth.sequence import GroundTruth, SynthSequence
+from seamark.frontend.camera import Rig
 from seamark.frontend.types import Mode
 
 NAME = "small_loop"
-SPECIFICATION = "loop,size=small,image=320x240,frames=240,sensors=rgbd"
-DEPTH_STEP = 50  # raw units, 1 cm: what makes the PNG files small
-JPEG_QUALITY = 82
+SPECIFICATION = "loop,size=small,image=320x240,frames=220,sensors=rgbd"
+DEPTH_FACTOR = 100.0  # whole centimetres: what makes the PNG files small
+JPEG_OPTIONS = (
+    *(cv2.IMWRITE_JPEG_QUALITY, 65),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420),
+)
 
 
 def small_loop_path() -> Path:
@@ -35,12 +40,13 @@ def open_small_loop() -> SynthSequence:
 def make_small_loop(target: Path) -> None:
     """Render the kept sequence into ``target``, which must not exist; how the folder in the package was made.
 
-    Coded smaller than the cache: JPEG of lower quality, depth in steps of 1 cm.
+    Coded smaller than the cache: JPEG of lower quality, depth in whole centimetres.
     """
     if target.exists():
         raise SeamarkError(f"{target} exists already")
     wanted = specification.parse(SPECIFICATION)
     truth = GroundTruth(trajectory.stamps(wanted.frames, specification.FPS), wanted.poses())
+    rig = Rig(wanted.rig.cam0, depth_factor=DEPTH_FACTOR)
     partial = target.with_name(f".{target.name}-{os.getpid()}")
     folder.start(partial, wanted.mode)
     try:
@@ -48,11 +54,11 @@ def make_small_loop(target: Path) -> None:
             for coded in pool.frames():
                 frame = sensor.decode(coded, 0, folder.names(coded.index)[0])
                 assert frame.depth is not None
-                depth = (frame.depth + DEPTH_STEP // 2) // DEPTH_STEP * DEPTH_STEP
-                picture = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+                depth = np.rint(frame.depth * (DEPTH_FACTOR / wanted.rig.depth_factor)).astype(np.uint16)
+                picture = cv2.imencode(".jpg", frame.image, JPEG_OPTIONS)[1]
                 png = cv2.imencode(".png", depth, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
                 folder.store(partial, sensor.CodedFrame(coded.index, bytes(picture), b"", bytes(png)))
-        folder.finish(partial, f"seamark synth {wanted}", wanted.mode, wanted.rig, truth)
+        folder.finish(partial, f"seamark synth {wanted}", wanted.mode, rig, truth)
         partial.rename(target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

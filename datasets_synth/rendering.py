@@ -20,6 +20,7 @@ from seamark.datasets_synth.worker import HEADER
 COMMAND = (sys.executable, "-P", "-m", "seamark.datasets_synth.worker")
 PROBE_TIMEOUT_S = 60.0
 POLL_S = 0.5
+FRAME_TIMEOUT_S = 240.0  # a first picture takes seconds of CPU, on a loaded machine minutes
 FRAMES_AHEAD = 12  # per worker: coded frames that wait for the consumer
 FRAMES_FOR_TWO_WORKERS = 60  # below that a second start-up costs more than it brings
 
@@ -32,9 +33,8 @@ def require_renderer(timeout_s: float = PROBE_TIMEOUT_S) -> str:
     """Return a summary of the rendering devices, found in a child process; raises NoVulkanDevice with the reason."""
     advice = "synthetic worlds cannot be rendered here; the kept sequence synth:small_loop needs no renderer"
     try:
-        answer = subprocess.run(
-            COMMAND, input=b'{"probe": true}\n', capture_output=True, timeout=timeout_s, check=False
-        )
+        job = json.dumps({"probe_s": int(timeout_s) + 5}).encode() + b"\n"
+        answer = subprocess.run(COMMAND, input=job, capture_output=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired as error:
         raise NoVulkanDevice(f"the Vulkan driver did not answer within {timeout_s:.0f} s: {advice}") from error
     if answer.returncode == 0 and answer.stdout:
@@ -92,7 +92,10 @@ class _Worker:
 
     def next_frame(self, index: int) -> CodedFrame:
         """Return frame ``index``, which is the next of this worker; raises SeamarkError where the worker has died."""
-        frame = self._frames.get()
+        try:
+            frame = self._frames.get(timeout=FRAME_TIMEOUT_S)
+        except queue.Empty:
+            raise SeamarkError(f"the rendering process gave no frame {index} within {FRAME_TIMEOUT_S:.0f} s") from None
         if frame is None or frame.index != index:
             code = self._process.wait()
             self._errors.seek(0)

@@ -14,6 +14,7 @@ DEPTH_FACTOR = 5000.0  # raw units per metre, as in the TUM RGB-D sets
 DEPTH_STEP_M = 0.001  # cheap depth cameras give whole millimetres
 DEPTH_RANGE_M = (0.3, 8.0)
 DEPTH_NOISE_PER_M = 0.001  # standard deviation = this times z squared: 1 mm at 1 m, 16 mm at 4 m
+DEPTH_NOISE_CELL_PX = 4
 IMAGE_NOISE_GREY = 2.0
 JPEG_QUALITY = 95
 
@@ -34,8 +35,14 @@ def expose(colour: NDArray[np.float32], rng: np.random.Generator) -> Image:
 
 
 def measure_depth(depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
-    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: noise growing with z squared, whole mm, 0 out of range."""
-    noisy = depth + np.float32(DEPTH_NOISE_PER_M) * depth**2 * rng.standard_normal(depth.shape, np.float32)
+    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: noise growing with z squared, whole mm, 0 out of range.
+
+    The noise is alike over DEPTH_NOISE_CELL_PX pixels, because such cameras match windows and not single pixels.
+    """
+    height, width = depth.shape
+    cells = rng.standard_normal((height // DEPTH_NOISE_CELL_PX + 1, width // DEPTH_NOISE_CELL_PX + 1), np.float32)
+    smooth = cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR)
+    noisy = depth + np.float32(1.5 * DEPTH_NOISE_PER_M) * depth**2 * smooth  # linear interpolation leaves 1 / 1.5
     steps = np.rint(noisy / np.float32(DEPTH_STEP_M))
     near, far = DEPTH_RANGE_M
     raw = np.where((depth >= near) & (noisy >= near) & (noisy <= far), steps * (DEPTH_STEP_M * DEPTH_FACTOR), 0)
@@ -50,7 +57,8 @@ def code_picture(image: Image) -> bytes:
 
 def code_depth(raw: NDArray[np.uint16]) -> bytes:
     """Return raw depth as 16 bit PNG, coded fast rather than small."""
-    return bytes(cv2.imencode(".png", raw, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    return bytes(cv2.imencode(".png", raw, fast)[1])
 
 
 def decode(coded: CodedFrame, stamp_ns: int, file: str) -> Frame:

@@ -1,12 +1,13 @@
 """The child process that renders: ``python -m seamark.datasets_synth.worker``; nothing else ever loads SAPIEN.
 
-It reads one JSON line from standard input (``probe``, or a specification with the first index and the step) and writes
-frames as headers and blobs to standard output. Standard input stays open as a life line: when the parent goes, so does
-the child.
+It reads one JSON line from standard input (``probe_s``, or a specification with first index and step) and writes
+frames as headers and blobs to standard output. While it renders, standard input stays open as a life line: when the
+parent goes, so does the child.
 """
 
 import json
 import os
+import signal
 import struct
 import sys
 import threading
@@ -57,12 +58,13 @@ def main() -> None:
     """Do the job that standard input names, then exit."""
     output = _private_output()
     job = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    if job.get("probe"):
+    if "probe_s" in job:
+        signal.alarm(job["probe_s"])  # a driver that hangs must not outlive its parent
         from seamark.datasets_synth.renderer import devices
 
         output.write(devices().encode())
     else:
+        threading.Thread(target=_die_with_parent, daemon=True).start()
         _render(job, output)
     output.close()
     sys.stderr.flush()

@@ -111,7 +111,7 @@ def loop_poses(plan: LoopPlan, n_frames: int, seed: int) -> NDArray[np.float64]:
     travelled = np.interp(at, np.arange(len(path)), np.concatenate([[0], np.cumsum(lengths)]))
     phases = rng.uniform(0, 2 * np.pi, 6)
     waves = np.sin(2 * np.pi * travelled[:, None] / np.array([7.3, 5.9, 4.7, 6.7, 8.9, 3.7]) + phases)
-    amplitudes = np.array([0.05, 0.02, np.deg2rad(2.5), np.deg2rad(1.5), np.deg2rad(1.0), 0.01])
+    amplitudes = np.array([0.09, 0.02, np.deg2rad(2.5), np.deg2rad(1.5), np.deg2rad(1.0), 0.01])
     side, lift, yaw, pitch, roll, bob = (waves * amplitudes).T
     aside = np.stack([-np.sin(heading), np.cos(heading)], axis=1) * side[:, None]
     position = np.column_stack([place + aside, EYE_HEIGHT_M + lift + bob])
