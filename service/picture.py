@@ -69,9 +69,9 @@ def _draw_map(record: RunRecord, report: dict[str, Any]) -> Figure:
         return figure
     if len(paths.truth):
         axes.plot(*_broken(paths.truth).T, color=TRUTH, lw=4.5, alpha=0.28, label="ground truth")
+    axes.plot(*_broken(paths.corrected).T, color=CORRECTED, lw=2.2, label="corrected", solid_capstyle="round")
     for k, one in enumerate(paths.odometry):
-        axes.plot(*_broken(one).T, color=ODOMETRY, lw=1.4, ls=(0, (5, 2)), label="odometry" if k == 0 else None)
-    axes.plot(*_broken(paths.corrected).T, color=CORRECTED, lw=1.9, label="corrected", solid_capstyle="round")
+        axes.plot(*_broken(one).T, color=ODOMETRY, lw=1.3, ls=(0, (5, 2)), label="odometry" if k == 0 else None)
     if len(paths.loops):
         label = f"loops ({len(paths.loops)})"
         axes.add_collection(LineCollection(list(paths.loops), colors=ACCEPTED, linewidths=1.1, alpha=0.75, zorder=3))
@@ -195,7 +195,7 @@ def _title(axes: Axes, record: RunRecord, subtitle: str) -> None:
 
 def _map_subtitle(report: dict[str, Any]) -> str:
     frames, figures = report["frames"], report["accuracy"]
-    parts = [report["mode"], f"{frames['tracked']} of {frames['total']} frames"]
+    parts = [report["mode"], f"{frames['in_trajectory']} of {frames['total']} frames"]
     if figures is None or figures["alignment"] != Alignment.SIM3:
         parts.append(f"{report['path_length_m']:.1f} m")
     else:

@@ -22,7 +22,8 @@ def blueprint(mode: Mode) -> Any:
     if mode is Mode.PLACES:
         body = rrb.Vertical(rrb.Horizontal(camera, pairs), rrb.Tabs(*plots), row_shares=[3, 1])
     else:
-        world = rrb.Spatial3DView(origin="/world", name="Map", contents=["/world/**", "- /world/cam/image/**"])
+        contents = ["/world/**", "- /world/cam/image/points", "- /world/cam/image/tracks"]
+        world = rrb.Spatial3DView(origin="/world", name="Map", contents=contents)
         side = rrb.Vertical(camera, pairs, rrb.Tabs(*plots), row_shares=[3, 3, 2])
         body = rrb.Horizontal(world, side, column_shares=[3, 2])
     return rrb.Blueprint(

@@ -28,17 +28,18 @@ NOT_LOST = frozenset({Outcome.INITIALISING, Outcome.PLACE})
 
 def build_report(record: RunRecord, config: SeamarkConfig) -> dict[str, Any]:
     """Return everything that report.json says; not-a-number and infinity become None."""
-    duration = _duration_s(record.odometry)
+    corrected = trajectories.corrected(record)
     report = {
         "sources": list(record.sources),
         "mode": record.mode.value,
         "frames": {
             "total": len(record.odometry),
             "tracked": trajectories.tracked(record),
+            "in_trajectory": len(corrected),
             "by_outcome": _counts(frame.outcome.value for frame in record.odometry),
             "by_quality": _counts(frame.quality.value for frame in record.odometry),
         },
-        "duration_s": duration,
+        "duration_s": _duration_s(record.odometry),
         "lost_spans": lost_spans(record.odometry),
         "sessions": _sessions(record),
         "keyframes": len(record.keyframes),
@@ -47,7 +48,7 @@ def build_report(record: RunRecord, config: SeamarkConfig) -> dict[str, Any]:
         "wall_s": record.wall_s,
         "frames_per_second": len(record.odometry) / record.wall_s if record.wall_s > 0 else None,
         "processes": [dataclasses.asdict(process) for process in record.processes],
-        "path_length_m": path_length(trajectories.corrected(record)),
+        "path_length_m": path_length(corrected),
         "accuracy": accuracy(record),
         "map_revision": record.snapshot.revision,
         "seed": config.seed,
@@ -152,8 +153,11 @@ def report_table(report: dict[str, Any]) -> Table:
 def _frames_text(frames: dict[str, Any], mode: str) -> str:
     others = {k: v for k, v in frames["by_outcome"].items() if k not in (Outcome.TRACKED, Outcome.PLACE)}
     detail = f" ({', '.join(f'{name} {count}' for name, count in others.items())})" if others else ""
-    seen = f"{frames['total']}" if mode == Mode.PLACES else f"{frames['tracked']} of {frames['total']} with a pose"
-    return seen + detail
+    if mode == Mode.PLACES:
+        return f"{frames['total']}{detail}"
+    apart = frames["tracked"] - frames["in_trajectory"]
+    elsewhere = f", {apart} of them apart from the trajectory" if apart else ""
+    return f"{frames['tracked']} of {frames['total']} with a pose{elsewhere}{detail}"
 
 
 def _accuracy_rows(figures: dict[str, Any] | None) -> Iterable[tuple[str, str]]:

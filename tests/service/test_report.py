@@ -20,7 +20,7 @@ def test_every_item(make_record: MakeRecord) -> None:
     assert report["sources"] == ["../data/round"]
     assert report["mode"] == "rgbd"
     assert report["frames"]["total"] == 62
-    assert report["frames"]["tracked"] == 60
+    assert report["frames"]["tracked"] == report["frames"]["in_trajectory"] == 60
     assert report["frames"]["by_outcome"] == {"lost": 1, "new_session": 1, "tracked": 59, "unreadable": 1}
     assert report["lost_spans"] == [
         {
@@ -80,6 +80,16 @@ def test_percentiles_leave_nan_out() -> None:
     assert percentiles([float("nan")]) == {"count": 0, "p50": None, "p95": None, "p99": None, "max": None}
     figures = percentiles([*range(101), float("nan")])
     assert figures == {"count": 101, "p50": 50, "p95": 95, "p99": 99, "max": 100}
+
+
+def test_frames_apart_from_the_trajectory_are_told(make_record: MakeRecord) -> None:
+    record = make_record()
+    apart = (record.snapshot.keyframe_ids >= 9).astype(np.int64)
+    report = build_report(replace(record, snapshot=replace(record.snapshot, components=apart)), load_config())
+    assert (report["frames"]["tracked"], report["frames"]["in_trajectory"]) == (60, 43)
+    stream = StringIO()
+    Console(file=stream, width=160).print(report_table(report))
+    assert "60 of 62 with a pose, 17 of them apart from the trajectory" in stream.getvalue()
 
 
 @pytest.mark.parametrize("mode", list(Mode))
