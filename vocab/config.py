@@ -9,15 +9,15 @@ class VocabConfig(BaseModel):
     """How places are described, compared and ranked.
 
     The weights say how far each cue is believed: a place's score is the weighted mean of its votes and of the likeness
-    of its histograms, both in 0..1. Histograms follow the light, so by default they have half the say of the votes among
-    unrelated places (over generated images the votes spread by 0.025 and the likeness by 0.13), and rank on their own
-    only where an image has no features. Under generated changes of light any larger weight costs more than it gains.
+    of its histograms, both in 0..1. Histograms follow the light, so by default they have half the say of the votes
+    among unrelated places (over generated images the votes spread by 0.025, the likeness by 0.13), and rank alone only
+    where an image has no features. Under generated changes of light any larger weight cost more than it gained.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     max_descriptors: int = Field(
-        default=2000, ge=1, description="At most this many descriptors of an image become words."
+        default=2000, ge=1, description="At most this many descriptors of an image, its first, become words."
     )
     candidates: int = Field(default=10, ge=1, description="How many places a query returns at most.")
     exclude_recent_s: float = Field(
