@@ -67,7 +67,8 @@ class Launcher:
     ) -> None:
         own_router = not settings.endpoint
         self.endpoint = settings.endpoint or listen or free_endpoint()
-        self._settings = replace(settings, endpoint=self.endpoint)
+        map_exists = settings.map_path is not None and settings.map_path.exists()
+        self._settings = replace(settings, endpoint=self.endpoint, restore=map_exists)
         self._own_router = own_router
         self._max_restarts = max_restarts
         self._commands = commands or {
@@ -160,9 +161,14 @@ class Launcher:
             self._session = open_session("client", connect=[self.endpoint])
         self._watch = Watch(self._session, self._settings.namespace)
         self._bus = ZenohBus(self._session, RUNNER, self._settings.namespace)
-        for name in reversed(NODES):  # readers first
+        for name in (BACKEND, VOCAB):  # readers first
             with self._lock:
                 self._start(name, self._settings)
+        if self._settings.restore:
+            self._watch.wait_for((BACKEND, VOCAB), START_TIMEOUT_S, self.check)
+            self._counting_on()
+        with self._lock:
+            self._start(FRONTEND, self._settings)
         self.wait_until_alive()
 
     def _start(self, name: str, settings: NodeSettings) -> None:
@@ -205,18 +211,18 @@ class Launcher:
             self._failure = NodeFailedError(sentence)
             return
         logger.warning("%s; it is started again", sentence)
-        settings = self._settings
+        self._settings = replace(self._settings, restore=self._settings.map_path is not None)
         if child.name == FRONTEND:
-            settings = self._counting_on(settings)
+            self._counting_on()
         with self._lock:
             if self._stopping:
                 return
             self.restarts[child.name] += 1
-            self._start(child.name, settings)
+            self._start(child.name, self._settings)
 
-    def _counting_on(self, settings: NodeSettings) -> NodeSettings:
-        """Return the settings with which a new front end goes on counting after the keyframes that were sent."""
-        keyframe_id, session = settings.first_keyframe_id, settings.first_session
+    def _counting_on(self) -> None:
+        """Let the next front end go on counting after the keyframes that were sent."""
+        keyframe_id, session = self._settings.first_keyframe_id, self._settings.first_session
         for node in (VOCAB, BACKEND):
             try:
                 status: Status = self.bus.request(STATUS[node], Empty())
@@ -225,8 +231,7 @@ class Launcher:
                 continue
             keyframe_id = max(keyframe_id, status.counters.get("next_keyframe_id", 0))
             session = max(session, status.counters.get("next_session", 0))
-        self._settings = replace(settings, first_keyframe_id=keyframe_id, first_session=session)
-        return self._settings
+        self._settings = replace(self._settings, first_keyframe_id=keyframe_id, first_session=session)
 
     def _stop_child(self, name: str, timeout_s: float) -> None:
         with self._lock:

@@ -1,154 +1,134 @@
 """The back end as a node: keyframes and candidates in; loops, the map and places out."""
 
+import sys
 import threading
-from collections.abc import Iterable, Mapping
 from concurrent.futures import Future
-from typing import Protocol
 
-from seamark.backend.types import Loop, MapSnapshot, Place
+from seamark import __version__
+from seamark.backend.errors import MapError
+from seamark.backend.graph_types import Solver
+from seamark.backend.map_store import MapStore
+from seamark.backend.slam import Slam, StepResult
+from seamark.backend.solver import SolverProcess
+from seamark.backend.types import MapSnapshot
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
-from seamark.frontend.types import Keyframe
+from seamark.frontend.types import Keyframe, Mode
 from seamark.service import topics
 from seamark.service.bus import Bus
+from seamark.service.config import config_hash
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
+from seamark.service.nodes.process import run_process
+from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Done
 from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
-
-
-class StepOutcome(Protocol):
-    """What the node reads of :class:`seamark.backend.slam.StepResult`."""
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """Return the verdicts of the step."""
-        ...
-
-    @property
-    def optimised(self) -> bool:
-        """Return whether poses have changed."""
-        ...
-
-    @property
-    def timings_ms(self) -> Mapping[str, float]:
-        """Return the latencies of the stages."""
-        ...
-
-
-class Mapper(Protocol):
-    """What the node needs of :class:`seamark.backend.slam.Slam`."""
-
-    def step(self, keyframe: Keyframe, candidates: Candidates) -> StepOutcome:
-        """Add a keyframe and verify its candidates."""
-        ...
-
-    def finish(self) -> StepOutcome:
-        """Settle what is undecided."""
-        ...
-
-    def snapshot(self) -> MapSnapshot:
-        """Return the map."""
-        ...
-
-    def locate(self, keyframe: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
-        """Verify a query against the map."""
-        ...
-
-
-class Store(Protocol):
-    """What the node needs of :class:`seamark.backend.map_store.MapStore`."""
-
-    def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Write a keyframe so that it survives a crash."""
-        ...
-
-    def add_loop(self, loop: Loop) -> None:
-        """Write a verdict."""
-        ...
-
-    def update_poses(self, snapshot: MapSnapshot) -> None:
-        """Write the poses of a revision."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
+MAPPED = "mapped"  # in the map's meta: the id of the last keyframe whose candidates have been seen to
 
 
 class BackendNode:
     """Joins keyframes with their candidates and maps them in the order of the keyframes.
 
     A keyframe is acknowledged when it is on disk, candidates when their keyframe has been mapped. With ``no_loops``
-    candidates are ignored. ``known_ids`` are keyframes of the map from before: sent again, they are not added again.
+    candidates are ignored. What ``store`` holds already is taken in first. ``solver`` is closed with the node.
     """
 
     def __init__(
         self,
         bus: Bus,
-        slam: Mapper,
-        store: Store | None,
+        slam: Slam,
+        store: MapStore | None,
         places: FrontendConfig,
         camera: Camera | None = None,
         *,
         no_loops: bool = False,
-        known_ids: Iterable[int] = (),
+        solver: Solver | None = None,
     ) -> None:
-        self._bus, self._slam, self._store, self._no_loops = bus, slam, store, no_loops
+        self._bus, self._slam, self._store, self._no_loops, self._solver = bus, slam, store, no_loops, solver
         self._meter = Meter(bus.node)
-        self._slam_lock = threading.Lock()  # place queries are answered in threads of their own
-        self._known = set(known_ids)
+        self._lock = threading.RLock()  # stop comes from another thread than the messages
+        self._settled = True
+        self._known: set[int] = set()
+        self._next_session = 0
         self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
         self._candidates: dict[int, tuple[Candidates, Future[None]]] = {}
-        self._next_session = 0
-        place_service = PlaceService(places, camera, self._rank, self._locate)
+        if store is not None:
+            self._restore(store)
+        place_service = PlaceService(places, camera, self._rank, slam.locate)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
-        bus.handle(topics.MAP_SNAPSHOT, lambda _: self._snapshot())
+        bus.handle(topics.MAP_SNAPSHOT, lambda _: self._slam.snapshot(), workers=1)
         bus.handle(topics.PLACE, place_service.answer, workers=PLACE_WORKERS)
         bus.handle(topics.CANDIDATES, self._on_candidates)
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 
     def stop(self) -> None:
         """Map what is waiting, settle what is undecided, and write the poses."""
-        for keyframe_id in list(self._waiting):
-            self._map(keyframe_id)
-        with self._slam_lock, self._meter.timed("finish"):
-            outcome = self._slam.finish()
-        self._tell(outcome)
-        if self._store is not None:
-            self._store.update_poses(self._snapshot())
+        with self._lock:
+            for keyframe_id in list(self._waiting):
+                self._map(keyframe_id)
+            if self._settled:
+                return
+            with self._meter.timed("finish"):
+                result = self._slam.finish()
+            self._tell(result)
+            if self._store is not None:
+                self._store.update_poses(self._slam.snapshot())
+            self._settled = True
 
     def close(self) -> None:
-        """Close the map's file."""
+        """Close the map's file and end the solver."""
         if self._store is not None:
             self._store.close()
+        if self._solver is not None:
+            self._solver.close()
 
-    def _on_keyframe(self, keyframe: Keyframe) -> None:
-        if keyframe.id in self._known:
-            self._meter.count("keyframes_again")
-            return
-        if self._store is not None:
-            with self._meter.timed("store"):
-                self._store.add_keyframe(keyframe)
+    def _restore(self, store: MapStore) -> None:
+        """Take in the map from before; keyframes stored and not yet mapped wait for their candidates again."""
+        mapped = int(store.meta().get(MAPPED, -1))
+        before = []
+        for keyframe in store.load_keyframes():
+            self._remember(keyframe)
+            if keyframe.id <= mapped:
+                before.append(keyframe)
+            else:
+                self._waiting[keyframe.id] = keyframe
+        if before:
+            ids = {keyframe.id for keyframe in before}
+            self._slam.restore(before, [loop for loop in store.load_loops() if loop.query_id in ids])
+        self._meter.keep("keyframes_restored", len(before))
+
+    def _remember(self, keyframe: Keyframe) -> None:
         self._known.add(keyframe.id)
-        self._waiting[keyframe.id] = keyframe
-        self._meter.count("keyframes")
         self._next_session = max(self._next_session, keyframe.session + 1)
         self._meter.keep("next_keyframe_id", max(self._known) + 1)
         self._meter.keep("next_session", self._next_session)
-        self._map_ready()
+
+    def _on_keyframe(self, keyframe: Keyframe) -> None:
+        with self._lock:
+            if keyframe.id in self._known:
+                self._meter.count("keyframes_again")
+                return
+            if self._store is not None:
+                with self._meter.timed("store"):
+                    self._store.add_keyframe(keyframe)
+            self._remember(keyframe)
+            self._waiting[keyframe.id] = keyframe
+            self._settled = False
+            self._meter.count("keyframes")
+            self._map_ready()
 
     def _on_candidates(self, candidates: Candidates) -> "Future[None] | None":
         keyframe_id = candidates.query_id
-        if keyframe_id in self._known and keyframe_id not in self._waiting:
-            self._meter.count("candidates_again")
-            return None
-        mapped: Future[None] = Future()
-        self._candidates[keyframe_id] = candidates, mapped
-        self._map_ready()
+        with self._lock:
+            if keyframe_id in self._known and keyframe_id not in self._waiting:
+                self._meter.count("candidates_again")
+                return None
+            mapped: Future[None] = Future()
+            self._candidates[keyframe_id] = candidates, mapped
+            self._map_ready()
         return mapped
 
     def _map_ready(self) -> None:
@@ -171,43 +151,87 @@ class BackendNode:
         if candidates is None or self._no_loops:
             self._meter.count("candidates_ignored" if self._no_loops else "candidates_missing")
             candidates = Candidates(keyframe_id, keyframe.stamp_ns, ())
+        self._settled = False
         try:
-            with self._slam_lock, self._meter.timed("map"):
-                outcome = self._slam.step(keyframe, candidates)
-            self._tell(outcome)
+            with self._meter.timed("map"):
+                result = self._slam.step(keyframe, candidates)
+            self._tell(result)
+            if self._store is not None:
+                self._store.set_meta({MAPPED: str(keyframe_id)})
         except Exception as error:
             mapped.set_exception(error)
             raise
         mapped.set_result(None)
 
-    def _tell(self, outcome: StepOutcome) -> None:
+    def _tell(self, result: StepResult) -> None:
         """Write down and publish what a step has found."""
-        self._meter.add(outcome.timings_ms)
-        for loop in outcome.loops:
-            self._meter.count(f"loops_{loop.reason}")
-            if self._store is not None:
-                self._store.add_loop(loop)
+        self._meter.add(result.timings_ms)
+        if self._store is not None and result.loops:
+            self._store.add_loops(result.loops)
+        for loop in result.loops:
+            self._meter.count(f"verdicts_{loop.reason}")
             self._bus.publish(topics.LOOP, loop)
-        if outcome.optimised:
+        if result.optimised:
             self._meter.count("optimisations")
-            snapshot = self._snapshot()
+            snapshot: MapSnapshot = self._slam.snapshot()
             if self._store is not None:
                 self._store.update_poses(snapshot)
             self._bus.publish(topics.MAP, snapshot)
-
-    def _snapshot(self) -> MapSnapshot:
-        with self._slam_lock:
-            return self._slam.snapshot()
 
     def _rank(self, observation: PlaceObservation) -> Candidates:
         self._meter.count("place_queries")
         ranked: Candidates = self._bus.request(topics.PLACES_RANK, observation)
         return ranked
 
-    def _locate(self, keyframe: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
-        with self._slam_lock:
-            return self._slam.locate(keyframe, candidates)
-
     def _on_drain(self, _: object) -> Done:
         self.stop()
         return Done(self._bus.node)
+
+
+def build(bus: Bus, settings: NodeSettings) -> BackendNode:
+    """Return the node for the settings; raises MapError and its kin when the map cannot be used."""
+    config, mode = settings.config, settings.mode
+    store = None if settings.map_path is None else MapStore(settings.map_path)
+    solver: Solver | None = None
+    try:
+        if store is not None:
+            _sign(store, settings)
+        if mode is not Mode.PLACES:
+            solver = _solver(settings)
+        return BackendNode(
+            bus,
+            Slam(config.backend, mode, solver, config.seed),
+            store,
+            config.frontend,
+            settings.rig.cam0 if settings.rig else None,
+            no_loops=settings.no_loops,
+            solver=solver,
+        )
+    except BaseException:
+        if solver is not None:
+            solver.close()
+        if store is not None:
+            store.close()
+        raise
+
+
+def _solver(settings: NodeSettings) -> Solver:
+    if settings.solver_process:
+        return SolverProcess(settings.config.backend)
+    from seamark.backend.pose_graph import PoseGraph  # loads GTSAM, which the node's own process does without
+
+    return PoseGraph(settings.config.backend)
+
+
+def _sign(store: MapStore, settings: NodeSettings) -> None:
+    """Write into a new map what made it; refuse one that another mode has made."""
+    meta = store.meta()
+    if meta.get("mode", settings.mode) != settings.mode:
+        raise MapError(f"the map {store.path} was made in mode {meta['mode']} and cannot go on in {settings.mode}")
+    if "mode" not in meta:
+        made_by = {"seamark": __version__, "config_hash": config_hash(settings.config)}
+        store.set_meta({"mode": str(settings.mode)} | made_by)
+
+
+if __name__ == "__main__":
+    sys.exit(run_process(topics.BACKEND, build))

@@ -13,7 +13,8 @@ class NodeSettings:
 
     ``vocabulary`` None is the one that ships with Seamark. ``map_path`` None keeps the map in memory only.
     ``first_keyframe_id`` and ``first_session`` let a front end that was restarted go on counting. ``solver_process``
-    puts the pose graph's solver into a process of its own, so that queries stay answered while it works.
+    puts the pose graph's solver into a process of its own, so that queries stay answered while it works. ``restore``
+    tells the vocabulary that there is a map to take places from; the back end, which owns the file, always looks.
     """
 
     mode: Mode
@@ -27,4 +28,5 @@ class NodeSettings:
     first_keyframe_id: int = 0
     first_session: int = 0
     solver_process: bool = True
+    restore: bool = False
     log_level: str = "WARNING"

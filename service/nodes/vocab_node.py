@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterable
 from concurrent.futures import Future
 
+from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Keyframe
 from seamark.service import topics
 from seamark.service.bus import Bus
@@ -26,9 +27,10 @@ class VocabNode:
         self._bus = bus
         self._index = index
         self._meter = Meter(bus.node)
+        self._next_keyframe_id = 0
         for observation in known:
             index.add(observation)
-        self._meter.keep("places", len(index))
+            self._remember(observation)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
         bus.handle(topics.PLACES_RANK, self._on_rank)
@@ -48,8 +50,13 @@ class VocabNode:
             known = keyframe.id in self._index  # sent again after a restart
             candidates = self._index.query(observation) if known else self._index.step(observation)
         self._meter.count("keyframes_again" if known else "keyframes")
-        self._meter.keep("places", len(self._index))
+        self._remember(observation)
         return self._bus.send(topics.CANDIDATES, candidates)
+
+    def _remember(self, observation: PlaceObservation) -> None:
+        self._next_keyframe_id = max(self._next_keyframe_id, observation.id + 1)
+        self._meter.keep("next_keyframe_id", self._next_keyframe_id)
+        self._meter.keep("places", len(self._index))
 
     def _on_rank(self, observation: PlaceObservation) -> Candidates:
         with self._meter.timed("rank_query"):
@@ -73,10 +80,14 @@ def observe(keyframe: Keyframe) -> PlaceObservation:
 
 
 def build(bus: Bus, settings: NodeSettings) -> VocabNode:
-    """Return the node for the settings; raises VocabularyFileError."""
+    """Return the node for the settings; raises VocabularyFileError, MapError."""
     path = settings.vocabulary
     vocabulary = Vocabulary.default() if path is None else Vocabulary.load(path)
-    return VocabNode(bus, PlaceIndex(vocabulary, settings.config.vocab))
+    index = PlaceIndex(vocabulary, settings.config.vocab)
+    if settings.map_path is None or not settings.restore:
+        return VocabNode(bus, index)
+    with MapStore(settings.map_path, read_only=True) as store:
+        return VocabNode(bus, index, (observe(keyframe) for keyframe in store.load_keyframes()))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """The three nodes on a LocalBus: what they send, in which order, and what they do with what goes wrong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from seamark import SeamarkError
+from seamark.backend.map_store import MapStore
+from seamark.backend.slam import StepResult
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.datasets_synth.toy import toy_sequence
 from seamark.frontend.config import FrontendConfig
@@ -39,13 +42,6 @@ def candidates(number: int, *places: int) -> Candidates:
     return Candidates(number, 100 * number, tuple(Candidate(place, 0.5, 0.5, 0.1) for place in places))
 
 
-@dataclass
-class FakeResult:
-    loops: tuple[Loop, ...] = ()
-    optimised: bool = False
-    timings_ms: dict[str, float] = field(default_factory=lambda: {"verify": 2.0})
-
-
 class FakeSlam:
     """Accepts the first candidate of every keyframe; fails at keyframe 13."""
 
@@ -53,7 +49,7 @@ class FakeSlam:
         self.steps: list[tuple[int, tuple[int, ...]]] = []
         self.finished = 0
 
-    def step(self, keyframe: Keyframe, candidates: Candidates) -> FakeResult:
+    def step(self, keyframe: Keyframe, candidates: Candidates) -> StepResult:
         if keyframe.id == 13:
             raise SeamarkError("thirteen")
         assert keyframe.id == candidates.query_id
@@ -61,11 +57,14 @@ class FakeSlam:
         loops = tuple(
             Loop(keyframe.id, one.id, True, Reason.ACCEPTED, 40, 0.5, 0.5, 0.1) for one in candidates.ranked[:1]
         )
-        return FakeResult(loops, optimised=bool(loops))
+        return StepResult(loops, 0, bool(loops), {"verify": 2.0})
 
-    def finish(self) -> FakeResult:
+    def finish(self) -> StepResult:
         self.finished += 1
-        return FakeResult(optimised=True, timings_ms={})
+        return StepResult((), 0, True)
+
+    def restore(self, keyframes: list[Keyframe], loops: list[Loop]) -> None:
+        self.restored = [one.id for one in keyframes], [(loop.query_id, loop.match_id) for loop in loops]
 
     def snapshot(self) -> MapSnapshot:
         ids = np.array([number for number, _ in self.steps], np.int64)
@@ -79,31 +78,21 @@ class FakeSlam:
         )
 
 
-class FakeStore:
-    def __init__(self) -> None:
-        self.log: list[tuple[str, int]] = []
+class FullDisk(MapStore):
+    """A map that cannot take keyframe 77."""
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         if keyframe.id == 77:
             raise SeamarkError("the disk is full")
-        self.log.append(("keyframe", keyframe.id))
-
-    def add_loop(self, loop: Loop) -> None:
-        self.log.append(("loop", loop.query_id))
-
-    def update_poses(self, snapshot: MapSnapshot) -> None:
-        self.log.append(("poses", len(snapshot.keyframe_ids)))
-
-    def close(self) -> None:
-        self.log.append(("close", 0))
+        super().add_keyframe(keyframe)
 
 
 class Backend:
     """A BackendNode between fakes, and who sends to it."""
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, folder: Path, **settings: Any) -> None:
         self.bus = LocalBus()
-        self.slam, self.store = FakeSlam(), FakeStore()
+        self.slam, self.store = FakeSlam(), FullDisk(folder / "map.seamark")
         self.node = BackendNode(self.bus.for_node("backend"), self.slam, self.store, FrontendConfig(), **settings)
         self.bus.for_node("vocab").handle(topics.KEYFRAME, lambda _: None)
 
@@ -126,8 +115,10 @@ class Backend:
         [candidates(0), keyframe(0), keyframe(1), candidates(1, 0), candidates(2, 0, 1), keyframe(2)],
     ],
 )
-def test_keyframes_meet_their_candidates_in_any_order_of_arrival(order: list[Keyframe | Candidates]) -> None:
-    backend = Backend()
+def test_keyframes_meet_their_candidates_in_any_order_of_arrival(
+    order: list[Keyframe | Candidates], tmp_path: Path
+) -> None:
+    backend = Backend(tmp_path)
     loops: list[Loop] = []
     maps: list[MapSnapshot] = []
     backend.bus.subscribe(topics.LOOP, loops.append)
@@ -136,37 +127,54 @@ def test_keyframes_meet_their_candidates_in_any_order_of_arrival(order: list[Key
     assert backend.slam.steps == [(0, ()), (1, (0,)), (2, (0, 1))]
     assert [(loop.query_id, loop.match_id) for loop in loops] == [(1, 0), (2, 0)]
     assert [len(one.keyframe_ids) for one in maps] == [2, 3]
-    assert [entry for entry in backend.store.log if entry[0] == "keyframe"] == [("keyframe", n) for n in range(3)]
+    assert [one.id for one in backend.store.load_keyframes()] == [0, 1, 2]
+    assert [(loop.query_id, loop.match_id) for loop in backend.store.load_loops()] == [(1, 0), (2, 0)]
     counters = backend.counters()
-    assert counters["keyframes"] == 3 and counters["loops_accepted"] == 2 and counters["next_keyframe_id"] == 3
+    assert counters["keyframes"] == 3 and counters["verdicts_accepted"] == 2 and counters["next_keyframe_id"] == 3
 
 
-def test_repeats_are_acknowledged_and_forgotten() -> None:
-    backend = Backend()
+def test_repeats_are_acknowledged_and_forgotten(tmp_path: Path) -> None:
+    backend = Backend(tmp_path)
     backend.send(keyframe(0), keyframe(0), candidates(0), candidates(0), keyframe(0), candidates(0))
     assert backend.slam.steps == [(0, ())]
     counters = backend.counters()
     assert counters["keyframes_again"] == 2 and counters["candidates_again"] == 2
-    restarted = Backend(known_ids=[0, 1])
-    restarted.send(keyframe(1), candidates(1), keyframe(2), candidates(2))
-    assert restarted.slam.steps == [(2, ())]
 
 
-def test_a_keyframe_that_the_vocabulary_refused_is_mapped_without_candidates() -> None:
-    backend = Backend()
+def test_a_restarted_back_end_takes_in_its_map_and_waits_for_what_was_not_mapped(tmp_path: Path) -> None:
+    first = Backend(tmp_path)
+    first.send(keyframe(0), candidates(0), keyframe(1, 1), candidates(1, 0), keyframe(2, 1))
+    first.store.close()  # killed: number 2 is on disk, its candidates were not acknowledged
+    second = Backend(tmp_path)
+    assert second.slam.restored == ([0, 1], [(1, 0)])
+    counters = second.counters()
+    assert counters == {"keyframes_restored": 2, "next_keyframe_id": 3, "next_session": 2}
+    second.send(candidates(1, 0), candidates(2, 1), keyframe(2, 1), keyframe(3), candidates(3))
+    assert second.slam.steps == [(2, (1,)), (3, ())]
+    assert second.counters()["candidates_again"] == second.counters()["keyframes_again"] == 1
+    second.bus.request(topics.DRAIN["backend"], Empty())
+    second.node.close()
+    third = Backend(tmp_path)
+    assert third.slam.restored == ([0, 1, 2, 3], [(1, 0), (2, 1)])
+    third.node.stop()
+    assert third.slam.finished == 0  # nothing new
+
+
+def test_a_keyframe_that_the_vocabulary_refused_is_mapped_without_candidates(tmp_path: Path) -> None:
+    backend = Backend(tmp_path)
     backend.send(keyframe(0), candidates(0), keyframe(1), keyframe(2), candidates(2, 0))
     assert backend.slam.steps == [(0, ()), (1, ()), (2, (0,))]
     assert backend.counters()["candidates_missing"] == 1
 
 
-def test_without_loops_candidates_are_ignored() -> None:
-    backend = Backend(no_loops=True)
+def test_without_loops_candidates_are_ignored(tmp_path: Path) -> None:
+    backend = Backend(tmp_path, no_loops=True)
     backend.send(keyframe(0), keyframe(1), candidates(0), candidates(1, 0), candidates(2, 0), keyframe(2))
     assert backend.slam.steps == [(0, ()), (1, ()), (2, ())]
 
 
-def test_a_failure_is_told_and_the_next_keyframes_are_mapped() -> None:
-    backend = Backend()
+def test_a_failure_is_told_and_the_next_keyframes_are_mapped(tmp_path: Path) -> None:
+    backend = Backend(tmp_path)
     with pytest.raises(RemoteError, match="thirteen"):
         backend.send(keyframe(13), candidates(13))
     with pytest.raises(RemoteError, match="the disk is full"):
@@ -176,16 +184,18 @@ def test_a_failure_is_told_and_the_next_keyframes_are_mapped() -> None:
     assert backend.slam.steps == [(78, ())]
 
 
-def test_draining_maps_what_waits_and_writes_the_poses() -> None:
-    backend = Backend()
+def test_draining_maps_what_waits_and_writes_the_poses(tmp_path: Path) -> None:
+    backend = Backend(tmp_path)
     backend.send(keyframe(0), keyframe(1))
     assert backend.slam.steps == []
     assert backend.bus.request(topics.DRAIN["backend"], Empty()) == Done("backend")
     assert backend.slam.steps == [(0, ()), (1, ())] and backend.slam.finished == 1
-    assert backend.store.log[-1] == ("poses", 2)
+    assert sorted(backend.store.load_poses()) == [0, 1]
+    assert backend.bus.request(topics.DRAIN["backend"], Empty()) == Done("backend")
+    assert backend.slam.finished == 1
     assert len(backend.bus.request(topics.MAP_SNAPSHOT, Empty()).keyframe_ids) == 2
     backend.node.close()
-    assert backend.store.log[-1] == ("close", 0)
+    assert not backend.store.path.with_name("map.seamark-wal").exists()
 
 
 class FakeFrontend:
@@ -376,4 +386,4 @@ def test_a_keyframe_sent_again_is_ranked_and_not_added_again(vocabulary: Vocabul
         bus.drain()
     assert ranked == [1, 1, 0]
     counters = bus.request(topics.STATUS["vocab"], Empty()).counters
-    assert counters == {"places": 2, "keyframes": 1, "keyframes_again": 2}
+    assert counters == {"places": 2, "keyframes": 1, "keyframes_again": 2, "next_keyframe_id": 2}
