@@ -1,0 +1,171 @@
+"""Pose, triangulation, two views and the window against scenes made in numpy."""
+
+import numpy as np
+import pytest
+
+from seamark.frontend import se3
+from seamark.frontend.camera import CalibrationError, Camera, Rig
+from seamark.frontend.pose import Observations, estimate_pose, pose_jacobian, residuals_and_jacobian, retract
+from seamark.frontend.two_view import initialise, triangulate
+from seamark.frontend.window import BundleProblem, LandmarkTable, adjust
+
+CAMERA = Camera(640, 480, 400, 410, 321, 239)
+
+
+def scene(rng: np.random.Generator, n: int = 120) -> np.ndarray:
+    return rng.uniform([-3, -2, 4], [3, 2, 9], (n, 3))
+
+
+def see(T_world_cam: np.ndarray, points: np.ndarray) -> np.ndarray:
+    in_cam = (np.linalg.inv(T_world_cam) @ np.column_stack([points, np.ones(len(points))]).T).T[:, :3]
+    return np.column_stack([400 * in_cam[:, 0] / in_cam[:, 2] + 321, 410 * in_cam[:, 1] / in_cam[:, 2] + 239])
+
+
+def unknown(n: int) -> np.ndarray:
+    return np.full(n, np.nan)
+
+
+def test_camera_refuses_nonsense() -> None:
+    with pytest.raises(CalibrationError, match="0, 4, 5 or 8"):
+        Camera(640, 480, 400, 400, 320, 240, (0.1, 0.2))
+    with pytest.raises(CalibrationError, match="finite"):
+        Camera(640, 480, float("nan"), 400, 320, 240)
+    with pytest.raises(CalibrationError, match="both cam1"):
+        Rig(CAMERA, CAMERA)
+
+
+@pytest.mark.parametrize("distortion", [(), (0.26, -0.95, -0.005, 0.0026, 1.16), (-0.3, 0.1, 1e-3, -1e-3)])
+def test_projection_and_rays_invert(distortion: tuple[float, ...]) -> None:
+    camera = Camera(640, 480, 517, 516, 318, 255, distortion)
+    pixels = np.stack(np.meshgrid(np.arange(40, 600, 80.0), np.arange(40, 440, 80.0)), -1).reshape(-1, 2)
+    back = camera.project(camera.rays(pixels) * 3.0)
+    assert np.abs(back - pixels).max() < 0.05
+
+
+def test_jacobians_agree_with_differences() -> None:
+    rng = np.random.default_rng(0)
+    T = se3.make(se3.exp_rotation(rng.normal(size=3)), rng.normal(size=3))
+    points = se3.transform(T, scene(rng, 6))
+    observations = Observations(points, see(T, points) + 3, rng.uniform(0.1, 0.3, 6), np.full(6, 0.01))
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        in_cam = se3.transform(se3.inverse(retract(T, step)), points)
+        return residuals_and_jacobian(in_cam, observations, CAMERA, 0.7)[0]
+
+    in_cam = se3.transform(se3.inverse(T), points)
+    analytic = residuals_and_jacobian(in_cam, observations, CAMERA, 0.7)[1] @ pose_jacobian(in_cam)
+    numeric = np.stack([(residuals(1e-6 * e) - residuals(-1e-6 * e)) / 2e-6 for e in np.eye(6)], axis=-1)
+    np.testing.assert_allclose(analytic, numeric, atol=1e-3, rtol=1e-5)
+
+
+def test_pose_with_outliers_has_an_honest_covariance() -> None:
+    """Expected: right inliers, and normalised errors (NEES) near 6 on average over many trials."""
+    rng = np.random.default_rng(1)
+    nees = []
+    for _ in range(60):
+        T = se3.make(se3.exp_rotation(0.3 * rng.normal(size=3)), rng.normal(size=3))
+        points = se3.transform(T, scene(rng))
+        pixels = see(T, points) + 0.7 * rng.normal(size=(120, 2))
+        pixels[:30] = rng.uniform(0, 480, (30, 2))
+        estimate = estimate_pose(
+            Observations(points, pixels, unknown(120), unknown(120)),
+            CAMERA,
+            threshold_px=2.5,
+            iterations=300,
+            pixel_sigma=0.7,
+            minimum=15,
+        )
+        assert estimate is not None
+        assert estimate.inliers[30:].mean() > 0.95
+        assert estimate.inliers[:30].sum() <= 3
+        error = se3.inverse(T) @ estimate.T_odom_cam
+        vector = np.concatenate([se3.log_rotation(error[:3, :3]), error[:3, 3]])
+        nees.append(vector @ np.linalg.inv(estimate.covariance) @ vector)
+    assert 3 < np.mean(nees) < 12
+
+
+def test_no_pose_from_rubbish() -> None:
+    rng = np.random.default_rng(2)
+    observations = Observations(scene(rng), rng.uniform(0, 480, (120, 2)), unknown(120), unknown(120))
+    settings = {"threshold_px": 2.5, "iterations": 300, "pixel_sigma": 0.7, "minimum": 15}
+    assert estimate_pose(observations, CAMERA, **settings) is None
+    assert estimate_pose(observations[np.arange(3)], CAMERA, **settings) is None
+
+
+def test_triangulation_finds_points_and_refuses_those_behind() -> None:
+    rng = np.random.default_rng(3)
+    points = scene(rng, 20)
+    T_b = se3.make(se3.exp_rotation(np.array([0, 0.1, 0])), np.array([0.8, 0, 0]))
+    rays_b = se3.transform(se3.inverse(T_b), points)
+    found, angle = triangulate(np.eye(4), points, T_b, rays_b)
+    np.testing.assert_allclose(found, points, atol=1e-9)
+    assert (angle > np.deg2rad(1)).all()
+    assert np.isnan(triangulate(np.eye(4), -points, T_b, -rays_b)[0]).all()
+
+
+def first_map(T_second: np.ndarray, noise_px: float = 0.4) -> object:
+    rng = np.random.default_rng(4)
+    points = scene(rng, 200)
+    first, second = see(np.eye(4), points), see(T_second, points)
+    return initialise(
+        first + noise_px * rng.normal(size=first.shape),
+        second + noise_px * rng.normal(size=second.shape),
+        CAMERA,
+        min_parallax_px=18,
+        min_landmarks=50,
+        min_angle_deg=0.9,
+    )
+
+
+def test_two_views_start_a_map_of_unit_median_depth() -> None:
+    T = se3.make(se3.exp_rotation(np.array([0.02, -0.06, 0.01])), np.array([0.6, 0.1, 0.15]))
+    result = first_map(T)
+    assert not isinstance(result, str)
+    assert np.nanmedian(result.landmarks[:, 2]) == pytest.approx(1, abs=0.02)
+    R_error = result.T_first_second[:3, :3].T @ T[:3, :3]
+    assert np.rad2deg(se3.rotation_angle(R_error)) < 0.5
+    direction = result.T_first_second[:3, 3] / np.linalg.norm(result.T_first_second[:3, 3])
+    assert direction @ (T[:3, 3] / np.linalg.norm(T[:3, 3])) > np.cos(np.deg2rad(3))
+
+
+def test_pure_rotation_starts_no_map() -> None:
+    """Test: the camera turns by 9 degrees on the spot. Expected: refused, in a word, never an invented translation."""
+    turned = first_map(se3.make(se3.exp_rotation(np.array([0.0, 0.16, 0.0])), np.zeros(3)))
+    assert isinstance(turned, str)
+
+
+def test_window_moves_poses_and_landmarks_to_the_truth() -> None:
+    rng = np.random.default_rng(5)
+    points = scene(rng)
+    true = np.stack([se3.make(se3.exp_rotation([0, 0.02 * k, 0]), np.array([0.25 * k, 0, 0])) for k in range(5)])
+    pixels = np.concatenate([see(T, points) for T in true]) + 0.3 * rng.normal(size=(600, 2))
+    depths = np.concatenate([1 / se3.transform(se3.inverse(T), points)[:, 2] for T in true])
+    depths += 0.002 * rng.normal(size=600)
+    landmark_of = np.tile(np.arange(120), 5)
+    order = np.argsort(landmark_of, kind="stable")
+    start = np.stack([retract(T, 0.03 * rng.normal(size=6)) for T in true])
+    start[0] = true[0]
+    problem = BundleProblem(
+        start,
+        1,
+        points + 0.1 * rng.normal(size=points.shape),
+        np.repeat(np.arange(5), 120)[order],
+        landmark_of[order],
+        Observations(np.zeros((600, 3)), pixels[order], depths[order], np.full(600, 0.002)),
+    )
+    result = adjust(problem, CAMERA, pixel_sigma=0.3, iterations=12)
+    np.testing.assert_array_equal(result.poses[0], true[0])
+    error = np.linalg.norm(result.poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    assert 0 < error[1:].max() < 0.01
+    assert np.linalg.norm(result.landmarks - points, axis=1).mean() < 0.05
+    assert 0.15 < np.median(result.errors_px) < 0.6
+
+
+def test_landmark_table_forgets_old_ids_only() -> None:
+    table = LandmarkTable()
+    ids = np.arange(20_000)
+    table.set(ids, np.column_stack([ids, ids, ids]).astype(float))
+    table.forget_before(15_000)
+    assert np.isnan(table.get(np.array([3, 14_999])))[:, 0].all()
+    np.testing.assert_array_equal(table.get(np.array([15_000, 19_999]))[:, 0], [15_000, 19_999])
+    assert np.isnan(table.get(np.array([10**9]))).all()
