@@ -1,0 +1,112 @@
+"""The real renderer: geometry, determinism and cache; skipped where nothing can render."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from seamark.datasets_synth.rendering import NoVulkanDevice, require_renderer
+from seamark.datasets_synth.scenario import open_synth
+from seamark.datasets_synth.sequence import SynthSequence
+from seamark.frontend import se3
+from seamark.frontend.types import Frame
+
+pytestmark = pytest.mark.simulator
+SPEC = "loop,size=small,image=320x240,frames=59,seed=2,sensors="  # 59 frames: one worker
+
+
+def _first(sequence: SynthSequence, count: int) -> list[Frame]:
+    with closing(sequence.frames()) as frames:  # type: ignore[type-var]
+        return list(islice(frames, count))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _renderer() -> None:
+    try:
+        require_renderer()
+    except NoVulkanDevice as missing:
+        pytest.skip(str(missing))
+
+
+@pytest.fixture(scope="module")
+def rgbd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[SynthSequence, list[Frame]]]:
+    sequence = open_synth(SPEC + "rgbd", cache_dir=tmp_path_factory.mktemp("cache"))
+    yield sequence, list(sequence.frames())
+
+
+def _matches(a: Frame, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    sift = cv2.SIFT_create(1000, enable_precise_upscale=True)
+    points_a, descriptors_a = sift.detectAndCompute(a.image, None)
+    points_b, descriptors_b = sift.detectAndCompute(image, None)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_a, descriptors_b, 2)
+    good = [one for one, two in pairs if one.distance < 0.7 * two.distance]
+    return (
+        np.array([points_a[match.queryIdx].pt for match in good]),
+        np.array([points_b[match.trainIdx].pt for match in good]),
+    )
+
+
+def _depth_at(sequence: SynthSequence, frame: Frame, points: np.ndarray) -> np.ndarray:
+    assert frame.depth is not None
+    whole = np.rint(points).astype(int)
+    return frame.depth[whole[:, 1], whole[:, 0]] / sequence.rig.depth_factor
+
+
+def test_pictures_agree_with_depth_and_pose(rgbd: tuple[SynthSequence, list[Frame]]) -> None:
+    sequence, frames = rgbd
+    poses = sequence.ground_truth.T_world_cam
+    for first, second in ((0, 1), (20, 21), (1, 56)):
+        a, b = _matches(frames[first], frames[second].image)
+        depth = _depth_at(sequence, frames[first], a)
+        T_b_a = se3.inverse(poses[second]) @ poses[first]
+        predicted = sequence.rig.cam0.project(
+            se3.transform(T_b_a, sequence.rig.cam0.rays(a) * depth[:, None])[depth > 0]
+        )
+        errors = predicted - b[depth > 0]
+        assert len(errors) > 60
+        assert np.median(np.linalg.norm(errors, axis=1)) < 0.5
+        assert np.all(np.abs(np.median(errors, axis=0)) < 0.2)  # half a pixel would show
+
+
+def test_pictures_are_neither_dark_nor_blown_out(rgbd: tuple[SynthSequence, list[Frame]]) -> None:
+    for frame in rgbd[1]:
+        assert 50 < frame.image.mean() < 190
+        assert (frame.image.max(axis=2) >= 254).mean() < 0.1
+        assert frame.depth is not None
+        assert (frame.depth > 0).mean() > 0.7
+
+
+def test_the_cache_gives_the_same_bits(rgbd: tuple[SynthSequence, list[Frame]]) -> None:
+    sequence, frames = rgbd
+    for a, b in zip(frames, sequence.frames(), strict=True):
+        assert a.image.tobytes() == b.image.tobytes()
+        assert a.depth is not None and b.depth is not None
+        assert a.depth.tobytes() == b.depth.tobytes()
+
+
+def test_rendering_again_gives_the_same_bits(rgbd: tuple[SynthSequence, list[Frame]], tmp_path: Path) -> None:
+    for a, b in zip(rgbd[1][:2], _first(open_synth(SPEC + "rgbd", cache_dir=tmp_path), 2), strict=True):
+        assert a.image.tobytes() == b.image.tobytes()
+        assert a.depth is not None and b.depth is not None
+        assert a.depth.tobytes() == b.depth.tobytes()
+
+
+def test_stereo_disparity_agrees_with_depth(rgbd: tuple[SynthSequence, list[Frame]], tmp_path: Path) -> None:
+    sequence, frames = rgbd
+    stereo = open_synth(SPEC + "stereo", cache_dir=tmp_path)
+    (pair,) = _first(stereo, 1)
+    assert pair.image_right is not None
+    assert pair.depth is None
+    left, right = _matches(pair, pair.image_right)
+    depth = _depth_at(sequence, frames[0], left)
+    known = depth > 0
+    expected = stereo.rig.cam0.fx * 0.12 / depth[known]
+    errors = (left[:, 0] - right[:, 0])[known] - expected
+    assert known.sum() > 100
+    assert np.median(np.abs(errors)) < 0.4
+    assert abs(np.median(errors)) < 0.15
+    assert abs(np.median(left[:, 1] - right[:, 1])) < 0.1

@@ -1,0 +1,62 @@
+"""The lap of the world loop and the sensor model, without a simulator."""
+
+import numpy as np
+import pytest
+
+from seamark import SeamarkError
+from seamark.datasets_synth import specification, trajectory, world_loop
+from seamark.datasets_synth.sensor import CodedFrame, code_depth, code_picture, decode, measure_depth
+from seamark.frontend import se3
+
+
+class TestPath:
+    @pytest.mark.parametrize("seed", [0, 3])
+    def test_full_lap_is_long_closed_and_slow_in_turns(self, seed: int) -> None:
+        poses = specification.parse(f"loop,seed={seed}").poses()
+        steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        assert 60 < steps.sum() < 75
+        assert steps.max() < 0.15
+        turns = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+        assert np.rad2deg(turns.max()) < 2.5
+        assert np.allclose(np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, :3], np.eye(3), atol=1e-12)
+        again = [int(np.argmin(np.linalg.norm(poses[:60, :3, 3] - pose[:3, 3], axis=1))) for pose in poses[575:]]
+        for late, early in zip(poses[575:], again, strict=True):
+            relative = se3.inverse(poses[early]) @ late
+            assert np.linalg.norm(relative[:3, 3]) < 0.35
+            assert np.rad2deg(se3.rotation_angle(relative[:3, :3])) < 12
+
+    @pytest.mark.parametrize("size", ["full", "small"])
+    def test_camera_keeps_clear_of_everything(self, size: str) -> None:
+        plan = world_loop.PLANS[size]
+        positions = world_loop.loop_poses(plan, 300, 0)[:, :3, 3]
+        for panel in world_loop.build_loop(plan, 0).panels:
+            along = [(positions - panel.corner) @ edge / (edge @ edge) for edge in (panel.right, panel.down)]
+            nearest = panel.corner + sum(
+                np.clip(share, 0, 1)[:, None] * edge
+                for share, edge in zip(along, (panel.right, panel.down), strict=True)
+            )
+            assert np.linalg.norm(positions - nearest, axis=1).min() > 0.3
+
+    def test_stamps_are_regular(self) -> None:
+        assert np.all(np.abs(np.diff(trajectory.stamps(50, 15.0)) - 1e9 / 15) <= 1)
+
+
+class TestSensor:
+    def test_depth_noise_grows_with_the_square_of_the_distance(self) -> None:
+        for metres in (1.0, 2.0, 4.0):
+            raw = measure_depth(np.full((240, 320), metres, np.float32), np.random.default_rng(0))
+            error = raw / 5000 - metres
+            assert error.std() == pytest.approx(np.hypot(0.001 * metres**2, 0.001 / 12**0.5), rel=0.12)
+            assert abs(error.mean()) < 0.1 * error.std() + 1e-5
+
+    def test_depth_out_of_range_is_zero(self) -> None:
+        depth = np.array([[0.0, 0.2, 0.5, 7.5, 9.0, 30.0]], np.float32).repeat(16, axis=0)
+        raw = measure_depth(depth, np.random.default_rng(0))
+        assert np.array_equal(raw[0] > 0, [False, False, True, True, False, False])
+
+    def test_broken_files_are_errors(self) -> None:
+        with pytest.raises(SeamarkError, match=r"picture of rendered frame rgb/1\.jpg"):
+            decode(CodedFrame(1, b""), 0, "rgb/1.jpg")
+        left, depth = code_picture(np.zeros((8, 8, 3), np.uint8)), code_depth(np.zeros((8, 8), np.uint16))
+        with pytest.raises(SeamarkError, match="depth of rendered frame"):
+            decode(CodedFrame(1, left, b"", depth[: len(depth) // 2]), 0, "rgb/1.jpg")
