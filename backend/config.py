@@ -20,7 +20,7 @@ class VerificationConfig(_Section):
     reprojection_px: float = Field(default=3.0, gt=0, description="largest reprojection error of an inlier of a pose")
     epipolar_px: float = Field(default=1.5, gt=0, description="largest distance from the epipolar line")
     confidence: float = Field(default=0.9999, gt=0, lt=1, description="confidence at which sampling stops")
-    iterations: int = Field(default=5000, ge=100, description="most samples drawn")
+    iterations: int = Field(default=2000, ge=100, description="most samples drawn")
     min_inliers: int = Field(default=15, ge=6, description="inliers of a pose below which it is refused")
     min_inlier_ratio: float = Field(default=0.15, ge=0, le=1, description="inliers of a pose per match with depth")
     min_epipolar_inliers: int = Field(

@@ -3,7 +3,6 @@
 from typing import Any
 
 import gtsam
-import gtsam.utilities
 import numpy as np
 from numpy.typing import NDArray
 

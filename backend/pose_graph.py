@@ -226,7 +226,9 @@ class PoseGraph:
     def _estimate(self) -> Estimate:
         ids = np.array(sorted(self._nodes), np.int64)
         poses = np.array([self._poses[i] for i in ids.tolist()]).reshape(-1, 4, 4)
-        scales = np.cbrt(np.linalg.det(poses[:, :3, :3]))
+        scales = np.ones(len(ids))  # exactly, where all is metric
+        if isinstance(self._variables, SimilarityVariables):
+            scales = np.cbrt(np.linalg.det(poses[:, :3, :3]))
         T_map_cam = poses.copy()
         T_map_cam[:, :3, :3] /= scales[:, None, None]
         components = np.array([self._frames[self._nodes[i].session] for i in ids.tolist()], np.int64)

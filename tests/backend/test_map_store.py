@@ -1,0 +1,184 @@
+"""The map on disk: what is written is read, damage is found, and kill -9 loses nothing acknowledged."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from seamark.backend.errors import MapCorruptError, MapError, MapVersionError
+from seamark.backend.map_store import MapStore
+from seamark.backend.types import Loop, MapSnapshot, Reason
+from seamark.frontend.types import Keyframe
+
+
+@pytest.fixture
+def keyframe(world, distorted):
+    def make(number: int) -> Keyframe:
+        w = world(number, 200)
+        return w.view(
+            np.eye(4),
+            distorted,
+            id=number,
+            session=1,
+            index=3 * number,
+            stamp_ns=1403715273262142976 + number,
+            file=f"cam0/{number}.png",
+            previous_id=number - 1 if number else None,
+            T_odom_cam=np.linalg.qr(w.rng.normal(size=(4, 4)))[0],
+            covariance=np.diag(w.rng.random(6)),
+        )
+
+    return make
+
+
+def assert_same(a, b):
+    for f in fields(a):
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if f.name == "features":
+            assert_same(x, y)
+        elif isinstance(x, np.ndarray):
+            assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), f.name
+        elif isinstance(x, float) and np.isnan(x):
+            assert np.isnan(y), f.name
+        else:
+            assert (type(x), x) == (type(y), y), f.name
+
+
+def test_everything_comes_back_to_the_bit(tmp_path, keyframe):
+    path = tmp_path / "map.seamark"
+    first, second = keyframe(0), keyframe(1)
+    bare = replace(keyframe(2), camera=None, T_odom_cam=None, covariance=None, metric=False)
+    loops = (
+        Loop(1, 0, True, Reason.ACCEPTED, 80, 0.5, 0.25, 0.125, np.eye(4), np.eye(6), 1.5),
+        Loop(2, 0, False, Reason.FEW_MATCHES, 0, 0.1, 0.2, float("nan")),
+    )
+    snapshot = MapSnapshot(
+        7,
+        np.array([0, 1, 2]),
+        np.array([1, 1, 1]),
+        np.array([1, 1, 1]),
+        np.stack([np.eye(4), 2 * np.eye(4), np.full((4, 4), np.nan)]),
+        np.array([1.0, 1.25, 1.0]),
+        loops,
+    )
+    with MapStore(path) as store:
+        store.set_meta({"mode": "rgbd", "vocabulary": "abc"})
+        for k in (first, second, bare):
+            store.add_keyframe(k)
+        store.add_loop(replace(loops[0], accepted=False, reason=Reason.UNCONFIRMED))
+        store.add_loops(loops)
+        store.update_poses(snapshot)
+    assert [p.name for p in tmp_path.iterdir()] == ["map.seamark"]
+    with MapStore(path, read_only=True) as store:
+        for expected, found in zip((first, second, bare), store.load_keyframes(), strict=True):
+            assert_same(expected, found)
+        for expected_loop, found_loop in zip(loops, store.load_loops(), strict=True):
+            assert_same(expected_loop, found_loop)
+        poses = store.load_poses()
+        np.testing.assert_array_equal(poses[1][0], 2 * np.eye(4))
+        assert poses[1][1:] == (1, 1.25)
+        assert poses[2][0] is None
+        assert store.meta() == {"mode": "rgbd", "vocabulary": "abc", "revision": "7"}
+        with pytest.raises(MapError, match="no keyframe 9"):
+            store.keyframe(9)
+        with pytest.raises(MapError, match="cannot be written"):
+            store.add_keyframe(first)
+
+
+def test_damage_is_found_and_named(tmp_path, keyframe):
+    path = tmp_path / "map.seamark"
+    with MapStore(path) as store:
+        store.add_keyframe(keyframe(0))
+        store.add_keyframe(keyframe(1))
+        store.add_loop(Loop(1, 0, True, Reason.ACCEPTED, 80, 0.5, 0.25, 0.125))
+    descriptors = keyframe(1).features.descriptors.tobytes()
+    data = bytearray(path.read_bytes())
+    at = data.index(descriptors[:64])
+    data[at] ^= 1
+    path.write_bytes(data)
+    with MapStore(path) as store:
+        assert store.keyframe(0).id == 0
+        with pytest.raises(MapCorruptError, match="keyframe 1 "):
+            store.keyframe(1)
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE loops SET inliers = 81")
+    database.close()
+    with MapStore(path) as store, pytest.raises(MapCorruptError, match="loop 1 to 0"):
+        store.load_loops()
+
+
+def test_strangers_are_not_taken_for_maps(tmp_path):
+    text, other, newer = tmp_path / "a.txt", tmp_path / "b.sqlite", tmp_path / "c.seamark"
+    text.write_text("not a data base at all\n" * 100)
+    with sqlite3.connect(other) as database:
+        database.execute("CREATE TABLE t (x)")
+    database.close()
+    MapStore(newer).close()
+    with sqlite3.connect(newer) as database:
+        database.execute("PRAGMA user_version = 99")
+    database.close()
+    for path, words in ((text, "is no map"), (other, "is no map"), (newer, "map version 99")):
+        before = path.read_bytes()
+        with pytest.raises(MapVersionError, match=words):
+            MapStore(path)
+        assert path.read_bytes() == before
+    with pytest.raises(MapError, match="there is no map"):
+        MapStore(tmp_path / "missing.seamark", read_only=True)
+    with pytest.raises(MapError, match="cannot be opened"):
+        MapStore(tmp_path / "no" / "folder.seamark")
+
+
+def test_a_full_disk_is_an_error_and_keeps_what_was_there(tmp_path, keyframe):
+    path = tmp_path / "map.seamark"
+    with MapStore(path) as store:
+        store.add_keyframe(keyframe(0))
+        store._database.execute("PRAGMA max_page_count = 60")
+        with pytest.raises(MapError, match="full"):
+            for number in range(1, 50):
+                store.add_keyframe(replace(keyframe(number), jpeg=os.urandom(100_000)))
+        assert_same(keyframe(0), store.keyframe(0))
+    with MapStore(path, read_only=True) as store:
+        assert_same(keyframe(0), next(iter(store.load_keyframes())))
+
+
+WRITER = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from seamark.backend.map_store import MapStore
+from seamark.backend.types import Loop, Reason
+store = MapStore(Path(sys.argv[1]))
+template = next(iter(store.load_keyframes()))
+for number in range(int(sys.argv[2]), 1_000_000):
+    store.add_keyframe(replace(template, id=number, jpeg=number.to_bytes(8, "big") * 4000))
+    store.add_loop(Loop(number, 0, True, Reason.ACCEPTED, number, 0.5, 0.25, 0.125))
+    print(number, flush=True)
+"""
+
+
+def test_kill_9_loses_nothing_acknowledged(tmp_path, keyframe):
+    """Test: a writer is killed eight times. Expected: each keyframe and loop that it had acknowledged is there."""
+    path = tmp_path / "map.seamark"
+    with MapStore(path) as store:
+        store.add_keyframe(keyframe(0))
+    number = 0
+    for life in range(8):
+        command = [sys.executable, "-c", WRITER, str(path), str(number + 1)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
+            for _ in range(3 + life):
+                number = int(writer.stdout.readline())
+            writer.send_signal(signal.SIGKILL)
+            number = max([number, *map(int, writer.stdout.read().split())])
+    with MapStore(path) as store:
+        found = {k.id: k.jpeg for k in store.load_keyframes()}
+        loops = {loop.query_id for loop in store.load_loops()}
+        assert number >= 52
+        for acknowledged in range(1, number + 1):
+            assert found[acknowledged] == acknowledged.to_bytes(8, "big") * 4000
+            assert acknowledged in loops
+        assert store._database.execute("PRAGMA integrity_check").fetchone()[0] == "ok"

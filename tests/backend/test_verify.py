@@ -1,0 +1,168 @@
+"""Verification against cameras and points whose poses are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from seamark.backend.config import VerificationConfig
+from seamark.backend.matching import match_features
+from seamark.backend.types import Reason
+from seamark.backend.verify import Rejected, Verification, verify
+
+CONFIG = VerificationConfig()
+W, T = (0.03, -0.08, 0.05), (0.4, -0.2, 0.3)
+
+
+def pose_errors(found, truth):
+    E = np.linalg.inv(truth) @ found
+    angle = np.arccos(np.clip((np.trace(E[:3, :3]) - 1) / 2, -1, 1))
+    return np.rad2deg(angle), np.linalg.norm(E[:3, 3])
+
+
+def test_matching_agrees_with_brute_force(world):
+    w = world(3, 300)
+    a, b = w.view(np.eye(4)), w.view(np.eye(4))
+    matches = match_features(a.features, b.features, 0.85)
+    D = np.linalg.norm(
+        a.features.descriptors[:, None].astype(float) - b.features.descriptors[None].astype(float), axis=2
+    )
+    for i, j in zip(matches.query, matches.match, strict=True):
+        row, column = np.sort(D[i]), np.sort(D[:, j])
+        assert D[i, j] == row[0] == column[0]
+        assert row[0] < 0.85 * row[1]
+        assert column[0] < 0.85 * column[1]
+    assert 50 < len(matches) <= 300
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.4, 0.7])
+@pytest.mark.parametrize("lens", ["ideal", "distorted"])
+def test_pose_is_found_despite_outliers_and_distortion(world, move, request, lens, outliers):
+    camera = request.getfixturevalue(lens)
+    w, truth = world(1), move(W, T)
+    match = w.view(np.eye(4), camera, depth_noise=0.005)
+    query = w.view(truth, camera, depth_noise=0.005, outliers=outliers)
+    result = verify(query, match, CONFIG, 5)
+    assert isinstance(result, Verification)
+    angle_deg, distance = pose_errors(result.T_match_query, truth)
+    assert 1e-6 < angle_deg < 0.15
+    assert 1e-6 < distance < 0.015
+    assert (1 - outliers) * 0.8 * result.matches < result.inliers < (1 - outliers + 0.1) * result.matches
+    assert result.scale == 1.0
+
+
+def test_swapped_sides_give_the_inverse(world, move):
+    w, truth = world(2), move(W, T)
+    a, b = w.view(np.eye(4)), w.view(truth)
+    forward, backward = verify(b, a, CONFIG, 1), verify(a, b, CONFIG, 1)
+    angle_deg, distance = pose_errors(np.linalg.inv(backward.T_match_query), forward.T_match_query)
+    assert angle_deg < 0.1
+    assert distance < 0.01
+
+
+@pytest.mark.parametrize("side", ["query", "match"])
+def test_landmarks_of_either_side_suffice(world, move, side):
+    w, truth = world(4), move(W, T)
+    match, query = w.view(np.eye(4), depth=side == "match"), w.view(truth, depth=side == "query")
+    result = verify(query, match, CONFIG, 1)
+    angle_deg, distance = pose_errors(result.T_match_query, truth)
+    assert angle_deg < 0.15
+    assert distance < 0.015
+
+
+def test_covariance_covers_the_error_and_not_much_more(world, move):
+    """Test: 40 noisy pairs. Expected: the squared error in standard deviations is near its 6, rather below."""
+    values = []
+    for seed in range(40):
+        w, truth = world(seed, 500), move(W, T)
+        side = seed % 2 == 0
+        match = w.view(np.eye(4), noise_px=1.0, depth_noise=0.005, depth=side)
+        query = w.view(truth, noise_px=1.0, depth_noise=0.005, depth=not side)
+        result = verify(query, match, CONFIG, seed)
+        E = np.linalg.inv(truth) @ result.T_match_query
+        w_error = np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]]) / 2
+        e = np.concatenate([w_error, E[:3, 3]])
+        values.append(e @ np.linalg.solve(result.covariance, e))
+    assert 0.1 < np.mean(values) < 6
+    assert max(values) < 22.5
+
+
+def test_mono_scale_is_measured(world, move):
+    """Test: the match's landmarks are in units of 0.5 m, the query's of 2 m. Expected: scale 4, pose in match units."""
+    w, truth = world(6), move(W, T)
+    for depth_query, depth_match in ((True, True), (False, True), (True, False)):
+        match = w.view(np.eye(4), depth_noise=0.01, unit=0.5, metric=False, depth=depth_match)
+        query = w.view(truth, depth_noise=0.01, unit=2.0, metric=False, depth=depth_query)
+        result = verify(query, match, CONFIG, 1)
+        if not depth_match:
+            assert isinstance(result, Rejected)
+            assert result.reason == Reason.BAD_GEOMETRY
+            continue
+        in_match_units = truth.copy()
+        in_match_units[:3, 3] /= 0.5
+        angle_deg, distance = pose_errors(result.T_match_query, in_match_units)
+        assert angle_deg < 0.15
+        assert distance < 0.03
+        if depth_query:
+            assert 3.95 < result.scale < 4.05
+            assert 1e-3 < result.scale_sigma < 0.02
+        else:
+            assert result.scale_sigma == np.inf
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_without_depth_the_place_is_recognised_but_no_pose_claimed(world, move, ideal, calibrated):
+    w = world(7)
+    camera = ideal if calibrated else None
+    match, query = w.view(np.eye(4), camera, depth=False), w.view(move(W, T), camera, depth=False, outliers=0.3)
+    result = verify(query, match, CONFIG, 1)
+    assert isinstance(result, Verification)
+    assert result.T_match_query is None
+    assert 0.5 * result.matches < result.inliers < 0.85 * result.matches
+
+
+@pytest.mark.parametrize(("calibrated", "depth"), [(True, True), (True, False), (False, False)])
+def test_unrelated_pairs_are_never_accepted(world, ideal, calibrated, depth):
+    """Test: 200 pairs with some 70 descriptor matches between points that have nothing to do with each other."""
+    accepted = 0
+    for seed in range(200):
+        w = world(1000 + seed, 80)
+        query = w.view(np.eye(4), ideal if calibrated else None, depth=depth, clutter=20)
+        match = w.view(np.eye(4), ideal if calibrated else None, depth=depth, clutter=20)
+        # The same descriptors at other places: shuffle points and landmarks together.
+        order = w.rng.permutation(len(match.features))
+        shuffled = replace(match.features, points=w.rng.uniform((0, 0), (640, 480), (len(order), 2)).astype(np.float32))
+        match = replace(match, features=shuffled, landmarks=match.landmarks[order])
+        result = verify(query, match, CONFIG, seed)
+        assert result.matches > 20
+        accepted += isinstance(result, Verification)
+    assert accepted == 0
+
+
+def test_crowded_inliers_are_refused(world, move):
+    """Test: a small thing is seen in both views, the rest differs. Expected: no claim about the camera."""
+    w = world(8, 400, low=-0.15, high=0.15, near=4, far=4.3)
+    match, query = w.view(np.eye(4), clutter=300), w.view(move((0, 0, 0.1), (0.1, 0, 0)), clutter=300)
+    result = verify(query, match, CONFIG, 1)
+    assert isinstance(result, Rejected)
+    assert result.reason == Reason.BAD_GEOMETRY
+    assert result.inliers > 20
+
+
+def test_few_matches_and_empty_images_are_named(world):
+    w = world(9, 40)
+    a, b = w.view(np.eye(4)), world(10, 40).view(np.eye(4))
+    result = verify(a, b, CONFIG, 1)
+    assert isinstance(result, Rejected)
+    assert result.reason in (Reason.FEW_MATCHES, Reason.FEW_INLIERS)
+    empty = replace(a, features=type(a.features).empty(), landmarks=np.zeros((0, 3), np.float32))
+    for pair in ((a, empty), (empty, a), (empty, empty)):
+        assert verify(*pair, CONFIG, 1) == Rejected(Reason.FEW_MATCHES, 0, 0)
+
+
+def test_same_seed_same_bits(world, move):
+    w = world(11)
+    match, query = w.view(np.eye(4)), w.view(move(W, T), outliers=0.5)
+    first, second = verify(query, match, CONFIG, 3), verify(query, match, CONFIG, 3)
+    assert first.T_match_query.tobytes() == second.T_match_query.tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
