@@ -73,8 +73,24 @@ def accuracy(record: RunRecord) -> dict[str, Any] | None:
     return {
         "alignment": alignment.value,
         "ground_truth_length_m": path_length(_during(truth, record.odometry)),
-        "odometry": {"session": session, **_errors(trajectories.as_given(record, session), truth, alignment)},
-        "corrected": _errors(trajectories.corrected(record), truth, alignment),
+        "odometry": {"session": session, **compare(trajectories.as_given(record, session), truth, alignment)},
+        "corrected": compare(trajectories.corrected(record), truth, alignment),
+    }
+
+
+def compare(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dict[str, Any]:
+    """Return ``ate`` and a list ``rpe`` (per frame, then per segment where the way is long enough), or ``error``."""
+    if len(estimate) == 0:
+        return {"error": "no frame has a pose"}
+    try:
+        absolute: AbsoluteError = ate(estimate, truth, alignment)
+    except EvaluationError as error:
+        return {"error": str(error)}
+    segments = [None, *(m for m in SEGMENTS_M if 2 * m <= absolute.length_m)]
+    relative = [_relative(estimate, truth, alignment, segment) for segment in segments]
+    return {
+        "ate": dataclasses.asdict(absolute),
+        "rpe": [dataclasses.asdict(one) for one in relative if one is not None],
     }
 
 
@@ -174,21 +190,6 @@ def _accuracy_rows(figures: dict[str, Any] | None) -> Iterable[tuple[str, str]]:
             millimetres, degrees = frame["translation_m"]["rmse"] * 1000, frame["rotation_deg"]["rmse"]
             text += f", RPE {millimetres:.1f} mm {degrees:.3f} deg per frame"
         yield key, text
-
-
-def _errors(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dict[str, Any]:
-    if len(estimate) == 0:
-        return {"error": "no frame has a pose"}
-    try:
-        absolute: AbsoluteError = ate(estimate, truth, alignment)
-    except EvaluationError as error:
-        return {"error": str(error)}
-    segments = [None, *(m for m in SEGMENTS_M if 2 * m <= absolute.length_m)]
-    relative = [_relative(estimate, truth, alignment, segment) for segment in segments]
-    return {
-        "ate": dataclasses.asdict(absolute),
-        "rpe": [dataclasses.asdict(one) for one in relative if one is not None],
-    }
 
 
 def _relative(

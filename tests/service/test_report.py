@@ -8,8 +8,9 @@ from rich.console import Console
 
 from seamark.frontend.types import Mode
 from seamark.service.config import config_hash, load_config
-from seamark.service.report import build_report, lost_spans, percentiles, report_table
-from seamark.service.types import RunRecord
+from seamark.service.evaluation import Alignment
+from seamark.service.report import build_report, compare, lost_spans, percentiles, report_table
+from seamark.service.types import RunRecord, Trajectory
 
 MakeRecord = Callable[..., RunRecord]
 
@@ -66,6 +67,8 @@ def test_what_cannot_be_measured_is_said(make_record: MakeRecord) -> None:
     other_time = replace(record.ground_truth, stamps_ns=record.ground_truth.stamps_ns + 10**15)
     figures = build_report(replace(record, ground_truth=other_time), load_config())["accuracy"]
     assert "ground truth" in figures["odometry"]["error"]
+    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    assert compare(nothing, record.ground_truth, Alignment.SE3) == {"error": "no frame has a pose"}
 
 
 def test_spans_end_where_a_pose_is_found(make_record: MakeRecord) -> None:
