@@ -13,7 +13,7 @@ from seamark.frontend.camera import Rig
 from seamark.frontend.types import Frame, Keyframe, Matrix, Mode, Odometry, Outcome, Quality
 from seamark.service import trajectories
 from seamark.service.picture import ACCEPTED, CORRECTED, ODOMETRY, REJECTED
-from seamark.service.recording_layout import FRAME_TIMELINE, blueprint
+from seamark.service.recording_layout import FRAME_TIMELINE, PLOTS, blueprint
 from seamark.service.sources.base import Unreadable
 from seamark.service.thumbnails import encode_jpeg, rgb, shrink, side_by_side
 from seamark.service.types import RunRecord, Trajectory
@@ -246,13 +246,18 @@ class RerunRecorder:
         if segments:
             strips = rr.LineStrips3D(np.array(segments), colors=rgb(ACCEPTED), radii=-1.5)
             self._recording.log("world/map/loops", strips, static=True)
-        keyframes = {keyframe.id: keyframe for keyframe in record.keyframes}
+        queries = {keyframe.id: keyframe for keyframe in record.keyframes}
         shown = sorted(loops, key=lambda loop: (not loop.accepted, -loop.inliers, loop.query_id, loop.match_id))
+        shown = [loop for loop in shown if loop.query_id in queries]
         for loop in shown[:MAX_PAIRS]:
-            query = keyframes.get(loop.query_id)
-            if query is not None:
-                self._set_time(query.index, query.stamp_ns)
-                self._log_pair(loop)
+            self._set_time(queries[loop.query_id].index, queries[loop.query_id].stamp_ns)
+            self._log_pair(loop)
+        # The best loop of each query, which comes first, makes the curves.
+        best = {loop.query_id: loop for loop in reversed(shown)}
+        for id_ in sorted(best):
+            self._set_time(queries[id_].index, queries[id_].stamp_ns)
+            self._recording.log("plots/loop_score", self._rr.Scalars(best[id_].score))
+            self._recording.log("plots/loop_inliers", self._rr.Scalars(float(best[id_].inliers)))
 
     def _log_pair(self, loop: Loop) -> None:
         kind = "accepted" if loop.accepted else "rejected"
@@ -273,7 +278,7 @@ class RerunRecorder:
         return self._rr.Transform3D(translation=T[:3, 3], quaternion=quaternion)
 
     def _style_plots(self) -> None:
-        names = {"inliers": ACCEPTED, "quality": CORRECTED, "reprojection_px": ODOMETRY, "latency_ms": "#8250df"}
-        for name, colour in names.items():
+        colours = (ACCEPTED, CORRECTED, ODOMETRY, "#8250df", ACCEPTED, CORRECTED)
+        for name, colour in zip(PLOTS, colours, strict=True):
             style = self._rr.SeriesLines(colors=rgb(colour), names=name, widths=1.5)
             self._recording.log(f"plots/{name}", style, static=True)

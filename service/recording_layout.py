@@ -5,14 +5,16 @@ from typing import Any
 from seamark.frontend.types import Mode
 
 FRAME_TIMELINE = "frame"
-PLOTS = ("inliers", "quality", "reprojection_px", "latency_ms")
+PLOTS = ("inliers", "quality", "reprojection_px", "latency_ms", "loop_score", "loop_inliers")
+PLOTS_OF_PLACES = ("loop_score", "loop_inliers", "latency_ms")
 
 
 def blueprint(mode: Mode) -> Any:
     """Return the layout: map, camera, loops with their image pairs, log and plots; no map in mode places."""
     import rerun.blueprint as rrb
 
-    plots = [rrb.TimeSeriesView(origin=f"/plots/{name}", name=name) for name in PLOTS]
+    names = PLOTS_OF_PLACES if mode is Mode.PLACES else PLOTS
+    plots = [rrb.TimeSeriesView(origin=f"/plots/{name}", name=name) for name in names]
     pairs = rrb.Tabs(
         rrb.Spatial2DView(origin="/loops/accepted/pair", name="Loops accepted"),
         rrb.Spatial2DView(origin="/loops/rejected/pair", name="Loops rejected"),

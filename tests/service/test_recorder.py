@@ -108,6 +108,7 @@ def test_everything_is_in_the_file(tmp_path: Path, make_record: MakeRecord) -> N
     assert pair is not None
     assert pair.shape == (180 + 8, 2 * 320 + 12, 3)
     assert counts["/loops/rejected/pair"] == 2
+    assert [value[0] for value in values(batches["/plots/loop_inliers"], "Scalars:scalars")] == [3, 9, 150]
     assert any("truncated" in text[0] for text in values(batches["/logs"], "TextLog:text"))
 
 
