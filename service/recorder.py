@@ -208,7 +208,8 @@ class RerunRecorder:
     def _log_corrected_camera(self, record: RunRecord, corrected: Trajectory) -> None:
         if len(corrected) == 0:
             return
-        index_of = {frame.stamp_ns: frame.index for frame in record.odometry}
+        # Of repeated stamps the first frame is the one with a pose.
+        index_of = {frame.stamp_ns: frame.index for frame in reversed(record.odometry)}
         indices = np.array([index_of[int(stamp)] for stamp in corrected.stamps_ns], np.int64)
         rr, path = self._rr, "world/map/cam"
         self._recording.log(path, rr.TransformAxes3D(0.3), static=True)
