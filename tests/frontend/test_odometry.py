@@ -1,0 +1,196 @@
+"""The front end on the toy world: accuracy against exact poses, and a defined outcome for every bad frame."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from seamark.datasets_synth.toy import ToyWorld, toy_sequence
+from seamark.frontend import se3
+from seamark.frontend.camera import CalibrationError
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.odometry import Frontend
+from seamark.frontend.types import Frame, Keyframe, Mode, Odometry, Outcome, Quality
+
+CONFIG = FrontendConfig(max_corners=250, sift_features=300)
+WORLD = ToyWorld(7)
+
+
+def track(
+    mode: Mode, frames: Iterable[Frame], config: FrontendConfig = CONFIG
+) -> tuple[list[Odometry], list[Keyframe]]:
+    frontend = Frontend(WORLD.rig(mode), mode, config)
+    odometry, keyframes = [], []
+    try:
+        for frame in frames:
+            result = frontend.step(frame)
+            odometry.append(result.odometry)
+            keyframes += result.keyframes
+        keyframes += frontend.finish()
+    finally:
+        frontend.close()
+    return odometry, keyframes
+
+
+def walk(trajectory: str, n: int, mode: Mode, *, of: int | None = None) -> tuple[list[Frame], np.ndarray]:
+    sequence = toy_sequence(trajectory, of or n, sensors=mode, world=WORLD)
+    frames = [frame for frame, _ in zip(sequence.frames(), range(n), strict=False)]
+    return frames, sequence.ground_truth.T_world_cam
+
+
+def errors(odometry: list[Odometry], truth: np.ndarray, first: int = 0) -> np.ndarray:
+    """Return the distance of every posed frame from the truth, both relative to frame ``first``."""
+    origin = odometry[first].T_odom_cam
+    assert origin is not None
+    out = []
+    for frame, T in zip(odometry, truth, strict=False):
+        if frame.T_odom_cam is not None:
+            estimate = se3.inverse(origin) @ frame.T_odom_cam
+            out.append(np.linalg.norm(estimate[:3, 3] - (np.linalg.inv(truth[first]) @ T)[:3, 3]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("mode", "bound_m"), [(Mode.RGBD, 0.06), (Mode.STEREO, 0.06)])
+def test_metric_odometry_follows_a_curve(mode: Mode, bound_m: float) -> None:
+    frames, truth = walk("loop", 40, mode, of=160)
+    odometry, keyframes = track(mode, frames)
+    assert [o.outcome for o in odometry] == [Outcome.NEW_SESSION] + [Outcome.TRACKED] * 39
+    length = np.linalg.norm(np.diff(truth[:40, :3, 3], axis=0), axis=1).sum()
+    assert length > 3
+    assert 0 < errors(odometry, truth).max() < bound_m
+    assert 4 <= len(keyframes) <= 35
+    for keyframe in keyframes:
+        known = np.isfinite(keyframe.landmarks[:, 0])
+        assert known.sum() > 40
+        seen = WORLD.camera.project(keyframe.landmarks[known])
+        np.testing.assert_allclose(seen, keyframe.features.points[known], atol=0.01)
+
+
+def test_mono_odometry_has_the_right_shape_and_fills_in_its_beginning() -> None:
+    frames, truth = walk("line", 50, Mode.MONO)
+    odometry, keyframes = track(Mode.MONO, frames)
+    start = next(i for i, o in enumerate(odometry) if o.outcome is Outcome.TRACKED)
+    assert 3 < start < 25
+    assert all(o.outcome is Outcome.INITIALISING for o in odometry[:start])
+    assert all(o.outcome is Outcome.TRACKED for o in odometry[start:])
+    assert [f.index for f in odometry[start].filled] == list(range(start))
+    assert not keyframes[0].metric
+    positions = np.stack([o.T_odom_cam[:3, 3] for o in odometry[start:]])
+    true = truth[start:50, :3, 3]
+    scale = np.linalg.norm(true[-1] - true[0]) / np.linalg.norm(positions[-1] - positions[0])
+    steps = scale * np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    np.testing.assert_allclose(steps, np.linalg.norm(np.diff(true, axis=0), axis=1), atol=0.012)
+    filled = np.stack([f.T_reference_cam[:3, 3] for f in odometry[start].filled])
+    lengths = scale * np.linalg.norm(filled, axis=1)
+    np.testing.assert_allclose(lengths, np.linalg.norm(truth[:start, :3, 3] - truth[0, :3, 3], axis=1), atol=0.03)
+
+
+def test_turning_on_the_spot_invents_no_translation() -> None:
+    frames, truth = walk("turn", 30, Mode.RGBD)
+    odometry, _ = track(Mode.RGBD, frames)
+    assert all(o.quality is not Quality.LOST for o in odometry)
+    assert 0 < errors(odometry, truth).max() < 0.015
+    R = odometry[0].T_odom_cam[:3, :3].T @ odometry[-1].T_odom_cam[:3, :3]
+    R_true = truth[0][:3, :3].T @ truth[29][:3, :3]
+    assert np.rad2deg(se3.rotation_angle(R.T @ R_true)) < 0.4
+    mono, _ = track(Mode.MONO, [replace(f, depth=None) for f in frames])
+    assert all(o.outcome is Outcome.INITIALISING for o in mono)
+
+
+def test_same_frames_same_bits() -> None:
+    frames, _ = walk("loop", 15, Mode.RGBD, of=160)
+    (a, keyframes_a), (b, keyframes_b) = track(Mode.RGBD, frames), track(Mode.RGBD, frames)
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one.T_odom_cam, other.T_odom_cam)
+    for one, other in zip(keyframes_a, keyframes_b, strict=True):
+        np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
+        np.testing.assert_array_equal(one.landmarks, other.landmarks)
+
+
+def black(frame: Frame) -> Frame:
+    return replace(frame, image=np.zeros_like(frame.image))
+
+
+def smaller(frame: Frame) -> Frame:
+    return replace(frame, image=np.ascontiguousarray(frame.image[:-2]))
+
+
+FAULTS: list[tuple[str, Callable[[Frame], Frame], Outcome]] = [
+    ("black", black, Outcome.LOST),
+    ("smaller", smaller, Outcome.WRONG_SIZE),
+    ("stamp repeated", lambda f: replace(f, stamp_ns=f.stamp_ns - 66_666_667), Outcome.REPEATED_STAMP),
+    ("stamp backward", lambda f: replace(f, stamp_ns=f.stamp_ns - 10**9), Outcome.STAMP_BACKWARD),
+]
+
+
+@pytest.mark.parametrize(("name", "fault", "expected"), FAULTS, ids=[name for name, *_ in FAULTS])
+def test_one_bad_frame_does_no_harm(name: str, fault: Callable[[Frame], Frame], expected: Outcome) -> None:
+    """Test: frame 8 of 16 is bad. Expected: its outcome says so, it has no pose, and the session goes on."""
+    frames, truth = walk("loop", 16, Mode.RGBD, of=160)
+    if name == "stamp repeated":
+        frames[8] = replace(frames[8], stamp_ns=frames[7].stamp_ns)
+    else:
+        frames[8] = fault(frames[8])
+    odometry, _ = track(Mode.RGBD, frames)
+    assert odometry[8].outcome is expected
+    assert odometry[8].T_odom_cam is None
+    assert {o.session for i, o in enumerate(odometry) if i != 8} == {0}
+    assert all(o.outcome in (Outcome.TRACKED, Outcome.RECOVERED) for o in odometry[9:])
+    assert errors(odometry, truth[np.arange(len(truth)) != 8] if odometry[8].T_odom_cam else truth).size == 15
+
+
+def test_a_jump_is_recovered_by_descriptors() -> None:
+    """Test: 12 frames are missing. Expected: no new session, the pose after the gap is right."""
+    frames, truth = walk("loop", 26, Mode.RGBD, of=160)
+    kept = [i for i in range(26) if not 10 <= i < 22]
+    odometry, _ = track(Mode.RGBD, [frames[i] for i in kept])
+    assert {o.session for o in odometry} == {0}
+    assert errors(odometry, truth[kept]).max() < 0.05
+
+
+def test_after_a_long_blackout_a_new_session_begins() -> None:
+    """Test: 1 s of black, then the other side of the room. Expected: LOST, then session 1; odometry does not jump."""
+    frames, _ = walk("loop", 160, Mode.RGBD)
+    dark = [black(replace(frames[10 + i])) for i in range(15)]
+    after = [replace(frames[80 + i], stamp_ns=frames[25 + i].stamp_ns) for i in range(6)]
+    odometry, keyframes = track(Mode.RGBD, [*frames[:10], *dark, *after])
+    assert all(o.quality is Quality.LOST for o in odometry[10:25])
+    assert odometry[25].outcome is Outcome.NEW_SESSION
+    assert {o.session for o in odometry[25:]} == {1}
+    jump = se3.inverse(odometry[9].T_odom_cam) @ odometry[25].T_odom_cam
+    np.testing.assert_allclose(jump, np.eye(4), atol=1e-9)
+    first_of_second = next(k for k in keyframes if k.session == 1)
+    assert first_of_second.previous_id is None
+
+
+def test_depth_full_of_rubbish_is_ignored() -> None:
+    """Test: a third of the depth is NaN, infinite or negative. Expected: tracked, nearly as well as with good depth."""
+    frames, truth = walk("loop", 20, Mode.RGBD, of=160)
+    rng = np.random.default_rng(0)
+    spoiled = []
+    for frame in frames:
+        depth = frame.depth.copy()
+        depth[:, ::9] = np.nan
+        depth[rng.random(depth.shape) < 0.1] = np.inf
+        depth[rng.random(depth.shape) < 0.1] = -1
+        spoiled.append(replace(frame, depth=depth))
+    odometry, _ = track(Mode.RGBD, spoiled)
+    assert all(o.quality is not Quality.LOST for o in odometry)
+    assert 0 < errors(odometry, truth).max() < 0.04
+
+
+def test_places_makes_every_frame_a_keyframe_without_a_pose() -> None:
+    frames, _ = walk("loop", 4, Mode.MONO, of=160)
+    frontend = Frontend(None, Mode.PLACES, CONFIG)
+    odometry = [frontend.step(f).odometry for f in frames]
+    frontend.close()
+    assert [o.keyframe_id for o in odometry] == [0, 1, 2, 3]
+    assert all(o.T_odom_cam is None and o.outcome is Outcome.PLACE for o in odometry)
+
+
+def test_modes_need_their_calibration() -> None:
+    with pytest.raises(CalibrationError, match="calibration"):
+        Frontend(None, Mode.MONO, CONFIG)
+    with pytest.raises(CalibrationError, match="both cameras"):
+        Frontend(WORLD.rig(Mode.RGBD), Mode.STEREO, CONFIG)
