@@ -28,6 +28,11 @@ class VocabConfig(BaseModel):
     exclude_recent_count: int = Field(
         default=8, ge=0, description="The last so many places of a session are not candidates."
     )
+    exclude_recent_count_places: int = Field(
+        default=20,
+        ge=0,
+        description="Takes the place of both in mode places, where stamps are a running index and say nothing of motion.",
+    )
     votes_weight: float = Field(default=1.0, ge=0.0, description="Weight of the visual words in the score.")
     histogram_weight: float = Field(default=0.1, ge=0.0, description="Weight of the colour histograms in the score.")
     histogram_bins: int = Field(default=32, ge=4, le=256, description="Bins of each of the six histograms.")
