@@ -5,6 +5,7 @@ frames as headers and blobs to standard output. While it renders, standard input
 parent goes, so does the child.
 """
 
+import fcntl
 import json
 import os
 import signal
@@ -17,7 +18,17 @@ HEADER = struct.Struct("<iIII")  # index, bytes of the left picture, the right p
 
 
 def _die_with_parent() -> None:
-    """End the process when standard input closes."""
+    """End the process when standard input closes.
+
+    A signal does it, because compiling shaders holds the interpreter for many seconds and no thread of Python would run
+    then; a thread is there for a pipe that has closed already.
+    """
+    fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)
+    threading.Thread(target=_wait_for_end, daemon=True).start()
+
+
+def _wait_for_end() -> None:
     sys.stdin.buffer.read()
     os._exit(1)
 
@@ -64,7 +75,7 @@ def main() -> None:
 
         output.write(devices().encode())
     else:
-        threading.Thread(target=_die_with_parent, daemon=True).start()
+        _die_with_parent()
         _render(job, output)
     output.close()
     sys.stderr.flush()
