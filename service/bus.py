@@ -7,7 +7,7 @@ everything happens in a reproducible order, and on a :class:`seamark.service.zen
 import heapq
 import itertools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -23,7 +23,6 @@ logger = logging.getLogger(__name__)
 #: its own ``send``): the message is acknowledged when that is done.
 Handler = Callable[[Any], Any]
 
-REQUEST_TIMEOUT_S = 10.0
 DRAIN_TIMEOUT_S = 600.0
 
 
@@ -92,6 +91,11 @@ class Bus(Protocol):
         """Return the node's name."""
         ...
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Return how many messages of each subscribed stream were missed, by the topic's name."""
+        ...
+
     def send(self, topic: Topic, message: object) -> "Future[None]":
         """Send on an acked topic to every reader; waits while the window is full.
 
@@ -103,11 +107,14 @@ class Bus(Protocol):
         """Publish on a stream; never waits for readers."""
         ...
 
-    def request(self, topic: Topic, message: object, timeout_s: float = REQUEST_TIMEOUT_S) -> Any:
-        """Return the reply; raises UnavailableError, TimedOutError, RemoteError or WireError."""
+    def request(self, topic: Topic, message: object, timeout_s: float | None = None) -> Any:
+        """Return the reply, in the topic's time unless told otherwise.
+
+        Raises UnavailableError, TimedOutError, RemoteError, WireError or BusClosedError.
+        """
         ...
 
-    def request_async(self, topic: Topic, message: object, timeout_s: float = REQUEST_TIMEOUT_S) -> "Future[Any]":
+    def request_async(self, topic: Topic, message: object, timeout_s: float | None = None) -> "Future[Any]":
         """Return a Future of the reply, with the errors of :meth:`request`; requests of one thread keep their order."""
         ...
 
@@ -198,6 +205,11 @@ class LocalBus:
         """Return the node's name."""
         return self._node
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Return nothing: here no message is missed."""
+        return {}
+
     def for_node(self, node: str) -> "LocalBus":
         """Return the bus of another node in this process."""
         return LocalBus(node, _hub=self._hub)
@@ -226,14 +238,14 @@ class LocalBus:
             received = self._hub.carry(message, topic.message)
             self._hub.push(topic, message, lambda callback=callback, received=received: callback(received))  # type: ignore[misc]
 
-    def request(self, topic: Topic, message: object, timeout_s: float = REQUEST_TIMEOUT_S) -> Any:
+    def request(self, topic: Topic, message: object, timeout_s: float | None = None) -> Any:
         """Call the handler now and return its reply."""
         check_kind(topic, Kind.REQUEST)
         assert topic.reply is not None
         reply = self._call(topic, topic.readers[0], self._hub.carry(message, topic.message))
         return self._hub.carry(reply, topic.reply)
 
-    def request_async(self, topic: Topic, message: object, timeout_s: float = REQUEST_TIMEOUT_S) -> "Future[Any]":
+    def request_async(self, topic: Topic, message: object, timeout_s: float | None = None) -> "Future[Any]":
         """Call the handler now; the Future is done."""
         future: Future[Any] = Future()
         try:

@@ -198,6 +198,8 @@ class Launcher:
             child.peak_rss_bytes, child.cpu_s = 1024 * usage.ru_maxrss, usage.ru_utime + usage.ru_stime
             self._ended.append(child)
             self._children.pop(child.name, None)
+            if self._watch is not None:
+                self._watch.forget(child.name)
             child.ended.set()
             if self._stopping:
                 return

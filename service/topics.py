@@ -53,7 +53,7 @@ class Topic:
 
     ``depth`` is, for an acked topic, how many messages may be unacknowledged before the sender waits; for a stream, how
     many a slow reader keeps; for a request, how many may wait before the next is refused as busy. ``recorded`` says
-    whether a recording of the service contains it.
+    whether a recording of the service contains it. ``timeout_s`` is how long a request waits unless told otherwise.
     """
 
     name: str
@@ -68,6 +68,7 @@ class Topic:
     reliability: Reliability = Reliability.RELIABLE
     congestion: Congestion = Congestion.BLOCK
     recorded: bool = False
+    timeout_s: float = 10.0
 
     def key(self, namespace: str, reader: str | None = None) -> str:
         """Return the key expression, of one reader of an acked topic if given; raises NamespaceError."""
@@ -114,6 +115,7 @@ FRAME = Topic(
     "One frame to process, in order and without loss; answered with its odometry.",
     reply=Odometry,
     recorded=True,
+    timeout_s=300.0,  # a back end that is slower than the frames holds them up, and that is meant
 )
 KEYFRAME = Topic(
     "keyframe",
@@ -184,6 +186,7 @@ PLACE = Topic(
     4,
     "Have I been here, and where am I? JPEG or PNG bytes in, ranked and verified places out.",
     reply=PlaceReply,
+    timeout_s=30.0,
 )
 DRAIN = {
     node: Topic(
@@ -196,6 +199,7 @@ DRAIN = {
         2,
         f"Answered when the {node} node has nothing left to do and all it sent is acknowledged.",
         reply=Done,
+        timeout_s=600.0,
     )
     for node in NODES
 }

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 from uuid import uuid4
@@ -12,7 +12,6 @@ import zenoh
 
 from seamark.service.bus import (
     DRAIN_TIMEOUT_S,
-    REQUEST_TIMEOUT_S,
     BusClosedError,
     Handler,
     UnavailableError,
@@ -22,7 +21,7 @@ from seamark.service.bus import (
 from seamark.service.topics import Congestion, Kind, Reliability, Topic
 from seamark.service.wire import WireError, decode, encode, encoding_of
 from seamark.service.zenoh_delivery import Outbox, Reader, pack_stamp, payload_of, unpack_stamp
-from seamark.service.zenoh_serving import Worker, all_done, bounded, on_end, on_reply, server
+from seamark.service.zenoh_serving import Worker, all_done, bounded, on_end, on_reply, server, settle
 
 logger = logging.getLogger(__name__)
 
@@ -56,13 +55,19 @@ class ZenohBus:
         self._ordered: Worker | None = None
         self._replies: Worker | None = None
         self._subscriber_threads: list[threading.Thread] = []
+        self._pending: set[Future[Any]] = set()
         self._closed = False
-        self.dropped: dict[str, int] = {}
+        self._dropped: dict[str, int] = {}
 
     @property
     def node(self) -> str:
         """Return the node's name."""
         return self._node
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Return how many messages of each subscribed stream were missed, by the topic's name."""
+        return dict(self._dropped)
 
     @property
     def resent(self) -> int:
@@ -84,33 +89,36 @@ class ZenohBus:
             number = self._published[topic.name] = self._published.get(topic.name, -1) + 1
             publisher.put(payload, attachment=pack_stamp(self._id, number, number))
 
-    def request(self, topic: Topic, message: object, timeout_s: float = REQUEST_TIMEOUT_S) -> Any:
+    def request(self, topic: Topic, message: object, timeout_s: float | None = None) -> Any:
         """Return the reply; never call it from a callback of a Future of this bus, which would wait for itself."""
         return self.request_async(topic, message, timeout_s).result()
 
-    def request_async(self, topic: Topic, message: object, timeout_s: float = REQUEST_TIMEOUT_S) -> "Future[Any]":
+    def request_async(self, topic: Topic, message: object, timeout_s: float | None = None) -> "Future[Any]":
         """Return a Future of the reply."""
         check_kind(topic, Kind.REQUEST)
         payload, future = encode(message), Future[Any]()
+        patience_s = topic.timeout_s if timeout_s is None else timeout_s
         future.set_running_or_notify_cancel()
         with self._lock:
             self._check_open()
             replies = self._replies = self._replies or Worker(f"{self._node}-replies")
+            self._pending.add(future)
+        future.add_done_callback(self._pending.discard)
         try:
             self._session.get(
                 topic.key(self._namespace),
                 zenoh.handlers.Callback(
-                    lambda reply: replies.submit(lambda: on_reply(topic, future, reply, timeout_s)),
+                    lambda reply: replies.submit(lambda: on_reply(topic, future, reply, patience_s)),
                     drop=lambda: replies.submit(lambda: on_end(topic, future)),
                     indirect=False,
                 ),
                 payload=payload,
                 encoding=encoding_of(topic.message),
-                timeout=timeout_s,
+                timeout=patience_s,
                 congestion_control=CONGESTION[topic.congestion],
             )
         except zenoh.ZError as error:
-            raise UnavailableError(f"topic {topic.name} cannot be asked: {error}") from error
+            settle(future, UnavailableError(f"topic {topic.name} cannot be asked: {error}"))
         return future
 
     def handle(self, topic: Topic, callback: Handler, *, workers: int = 0) -> None:
@@ -176,6 +184,8 @@ class ZenohBus:
             declared.undeclare()
         for outbox in self._outboxes.values():  # before the workers, which may be waiting for room in a window
             outbox.close()
+        for future in list(self._pending):
+            settle(future, BusClosedError(f"the bus of {self._node} was closed before the reply came"))
         for worker in self._workers:
             if isinstance(worker, ThreadPoolExecutor):
                 worker.shutdown(cancel_futures=True)
@@ -232,7 +242,7 @@ class ZenohBus:
                 sender, number, _ = unpack_stamp(sample.attachment)
                 missed = number - latest.get(sender, number - 1) - 1
                 latest = {sender: number} if len(latest) > 64 else latest | {sender: number}
-                self.dropped[topic.name] = self.dropped.get(topic.name, 0) + max(0, missed)
+                self._dropped[topic.name] = self._dropped.get(topic.name, 0) + max(0, missed)
                 callback(decode(payload_of(sample), topic.message))
             except WireError as error:
                 logger.warning("a message on %s was ignored: %s", topic.name, error)

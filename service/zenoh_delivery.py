@@ -129,11 +129,13 @@ class Outbox:
         return item.done
 
     def drain(self, deadline: float) -> None:
-        """Wait until nothing is outstanding; raises TimedOutError, or the first refusal since the last drain."""
+        """Wait until nothing is outstanding; raises TimedOutError, BusClosedError, or the first refusal."""
         with self._room:
             while self._outstanding and not self._closed:
                 if not self._room.wait(max(0.0, deadline - time.monotonic())) and time.monotonic() >= deadline:
                     raise TimedOutError(f"{self._outstanding} messages to {self._key} are not acknowledged")
+            if self._outstanding:
+                raise BusClosedError(f"{self._key} was closed before {self._outstanding} messages arrived")
             failure, self._failure = self._failure, None
         if failure is not None:
             raise failure

@@ -4,12 +4,13 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from seamark.service.bus import (
     BusClosedError,
+    BusError,
     ErrorCode,
     Handler,
     RemoteError,
@@ -18,7 +19,7 @@ from seamark.service.bus import (
     error_reply,
 )
 from seamark.service.topics import Topic
-from seamark.service.wire import decode, encode, encoding_of
+from seamark.service.wire import WireError, decode, encode, encoding_of
 from seamark.service.zenoh_delivery import TIMEOUT_PAYLOAD, answer, payload_of, refusal, refuse
 
 logger = logging.getLogger(__name__)
@@ -121,22 +122,28 @@ def server(topic: Topic, callback: Handler) -> Callable[[Any], None]:
 
 def on_reply(topic: Topic, future: "Future[Any]", reply: Any, timeout_s: float) -> None:
     """Settle the Future of a request by a reply or an error reply."""
-    if future.done():
-        return
-    try:
-        if reply.ok is not None:
-            assert topic.reply is not None
-            future.set_result(decode(payload_of(reply.ok), topic.reply))
-            return
+    if reply.ok is None:
         payload = reply.err.payload.to_bytes()
-        if payload == TIMEOUT_PAYLOAD:
-            raise TimedOutError(f"no reply on topic {topic.name} in {timeout_s:g} s")
-        raise refusal(payload)
-    except Exception as error:
-        future.set_exception(error)
+        timed_out = payload == TIMEOUT_PAYLOAD
+        late = TimedOutError(f"no reply on topic {topic.name} in {timeout_s:g} s")
+        settle(future, late if timed_out else refusal(payload))
+        return
+    assert topic.reply is not None
+    try:
+        content: object = decode(payload_of(reply.ok), topic.reply)
+    except WireError as error:
+        settle(future, error)
+    else:
+        with contextlib.suppress(InvalidStateError):
+            future.set_result(content)
 
 
 def on_end(topic: Topic, future: "Future[Any]") -> None:
     """Settle the Future of a request that has ended without any reply."""
-    if not future.done():
-        future.set_exception(UnavailableError(f"nobody serves topic {topic.name}, or its node died while it worked"))
+    settle(future, UnavailableError(f"nobody serves topic {topic.name}, or its node died while it worked"))
+
+
+def settle(future: "Future[Any]", error: BusError | WireError) -> None:
+    """End a request with an error, unless it has ended before."""
+    with contextlib.suppress(InvalidStateError):
+        future.set_exception(error)

@@ -114,6 +114,11 @@ class Watch:
                 self._condition.wait(0.2)
                 check()
 
+    def forget(self, node: str) -> None:
+        """Take a node for dead before its token has gone."""
+        with self._condition:
+            self._alive.discard(node)
+
     def close(self) -> None:
         """Stop watching."""
         self._subscriber.undeclare()

@@ -15,7 +15,7 @@ from seamark.service.bus import Bus
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.requests import Done, EncodedFrame
+from seamark.service.requests import Done, EncodedFrame, Status
 from seamark.service.sources.decode import UnreadableImageError, decode, to_image
 
 
@@ -35,7 +35,7 @@ class FrontendNode:
         self._lock = threading.Lock()  # the camera's stream comes in a thread of its own
         self._finished = False
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
-        bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
+        bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
         bus.handle(topics.FRAME, self._on_frame)
         bus.subscribe(topics.CAMERA, self._on_frame)
 
@@ -64,6 +64,11 @@ class FrontendNode:
         self._meter.count(f"frames_{odometry.outcome}")
         self._meter.add(odometry.stages_ms)
         return odometry
+
+    def _status(self) -> Status:
+        for stream, missed in self._bus.dropped.items():
+            self._meter.keep(f"{stream}_dropped", missed)
+        return self._meter.status()
 
     def _on_drain(self, _: object) -> Done:
         self.stop()

@@ -1,6 +1,7 @@
 """The vocabulary as a node: keyframes in, ranked places out."""
 
 import sys
+import threading
 from collections.abc import Iterable
 from concurrent.futures import Future
 
@@ -27,13 +28,14 @@ class VocabNode:
         self._bus = bus
         self._index = index
         self._meter = Meter(bus.node)
+        self._lock = threading.Lock()  # queries have a thread of their own: sending keyframes on may take a while
         self._next_keyframe_id = 0
         for observation in known:
             index.add(observation)
             self._remember(observation)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
-        bus.handle(topics.PLACES_RANK, self._on_rank)
+        bus.handle(topics.PLACES_RANK, self._on_rank, workers=1)
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 
     def stop(self) -> None:
@@ -46,7 +48,7 @@ class VocabNode:
     def _on_keyframe(self, keyframe: Keyframe) -> "Future[None]":
         """Rank and add; the keyframe is acknowledged when its candidates are."""
         observation = observe(keyframe)
-        with self._meter.timed("rank"):
+        with self._lock, self._meter.timed("rank"):
             known = keyframe.id in self._index  # sent again after a restart
             candidates = self._index.query(observation) if known else self._index.step(observation)
         self._meter.count("keyframes_again" if known else "keyframes")
@@ -59,7 +61,7 @@ class VocabNode:
         self._meter.keep("places", len(self._index))
 
     def _on_rank(self, observation: PlaceObservation) -> Candidates:
-        with self._meter.timed("rank_query"):
+        with self._lock, self._meter.timed("rank_query"):
             return self._index.query(observation)
 
     def _on_drain(self, _: object) -> Done:

@@ -265,6 +265,16 @@ def test_frames_are_answered_and_late_keyframes_sent() -> None:
     assert status.node == "frontend" and 20e6 < status.rss_bytes <= status.peak_rss_bytes < 20e9 and status.cpu_s > 0
 
 
+def test_frames_of_a_live_camera_are_taken_too() -> None:
+    bus, published = LocalBus(), []
+    FrontendNode(bus.for_node("frontend"), FakeFrontend())  # type: ignore[arg-type]
+    bus.subscribe(topics.ODOMETRY, lambda odometry: published.append(odometry.index))
+    for index in range(2):
+        bus.publish(topics.CAMERA, Frame(3 * index, index, GREY))
+    bus.pump()
+    assert published == [0, 3]
+
+
 def test_a_restarted_front_end_goes_on_counting() -> None:
     odometry, keyframes, _ = run_frontend(
         [Frame(index, index, GREY) for index in range(3)], first_keyframe_id=40, first_session=2

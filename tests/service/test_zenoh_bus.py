@@ -33,6 +33,7 @@ BOTH = topics.Topic("both", "both", topics.Kind.ACKED, Candidates, "a", ("b", "c
 NEXT = topics.Topic("next", "next", topics.Kind.ACKED, Candidates, "b", ("c",), 4, "For this test.")
 STREAM = topics.Topic("stream", "stream", topics.Kind.STREAM, Candidates, "a", ("b",), 1, "For this test.")
 ASK = topics.Topic("ask", "ask", topics.Kind.REQUEST, Candidates, "a", ("b",), 1, "For this test.", reply=Done)
+LOOP_BACK = topics.Topic("back", "back", topics.Kind.REQUEST, Candidates, "b", ("a",), 1, "For this test.", reply=Done)
 FRAMES = topics.Topic("f", "f", topics.Kind.REQUEST, Frame, "a", ("b",), 16, "For this test.", reply=Candidates)
 PICTURE = topics.Topic("p", "p", topics.Kind.REQUEST, PlaceQuery, "a", ("b",), 4, "For this test.", reply=Done)
 PATIENCE_S = 20.0
@@ -364,6 +365,33 @@ def test_closing_releases_a_waiting_sender_and_settles_everything(net: Net) -> N
     assert all(isinstance(future.exception(0), BusClosedError) for future in futures)
     with pytest.raises(BusClosedError):
         a.request(ASK, message(0))
+
+
+def test_closing_ends_a_handler_that_waits_for_a_reply_or_for_its_own_messages(net: Net) -> None:
+    a, b, hold = net.bus("a"), net.bus("b"), threading.Event()
+    ended: list[str] = []
+
+    def wait_for_ever(m: Candidates) -> Done:
+        try:
+            if m.query_id == 0:
+                b.send(NEXT, message(0))
+                b.drain()
+            else:
+                b.request(LOOP_BACK, message(0), PATIENCE_S)
+        except BusClosedError:
+            ended.append("closed")
+            raise
+        return Done("b")
+
+    a.handle(LOOP_BACK, lambda m: (hold.wait(PATIENCE_S), Done("a"))[1])
+    b.handle(ASK, wait_for_ever, workers=2)
+    wait_until(lambda: a.matched(ASK) and b.matched(LOOP_BACK))
+    futures = [a.request_async(ASK, message(number), PATIENCE_S) for number in range(2)]
+    wait_until(lambda: b.resent > 0 and len(b._pending) == 1)
+    net.close(b)
+    hold.set()
+    assert ended == ["closed"] * 2
+    assert [type(future.exception(PATIENCE_S)) for future in futures] == [UnavailableError] * 2
 
 
 def test_the_watch_sees_nodes_come_and_go(net: Net) -> None:
