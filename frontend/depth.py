@@ -4,7 +4,6 @@ Every sensor answers with the inverse depth (1/m) of points and its standard dev
 inverse depth is what both a disparity and a triangulation measure, and its noise stays Gaussian at long range.
 """
 
-import warnings
 from typing import Protocol
 
 import numpy as np
@@ -64,15 +63,16 @@ class DepthImage:
         around = np.stack([depth[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]).astype(np.float64)
         if depth.dtype == np.uint16:
             around /= self._depth_factor
-        around[~np.isfinite(around) | (around <= 0)] = np.nan
+        usable = np.isfinite(around) & (around > 0)
+        readings = usable.sum(axis=0)
+        around = np.sort(np.where(usable, around, np.inf), axis=0)
+        column = np.arange(len(points))
+        z = around[np.maximum(readings - 1, 0) // 2, column]
         c = self._config
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # points without any reading around them are expected
-            z = np.nanmedian(around, axis=0)
-            spread = np.nanmax(around, axis=0) - np.nanmin(around, axis=0)
-        with np.errstate(invalid="ignore"):
-            valid = (z > c.depth_min_m) & (z < c.depth_max_m) & (np.isfinite(around).sum(axis=0) >= MIN_READINGS)
-            valid &= spread < np.maximum(EDGE_SPREAD * z, 4 * (c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2))
+        valid = (readings >= MIN_READINGS) & (z > c.depth_min_m) & (z < c.depth_max_m)
+        z = np.where(valid, z, np.nan)
+        spread = np.where(valid, around[np.maximum(readings - 1, 0), column], 0) - np.where(valid, around[0], 0)
+        valid &= spread < np.maximum(EDGE_SPREAD * z, 4 * (c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2))
         z = np.where(valid, z, np.nan)
         sigma_z = c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2
         return 1 / z, sigma_z / z**2

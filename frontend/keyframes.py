@@ -21,6 +21,7 @@ from seamark.frontend.features import extract_features, match_descriptors, thumb
 from seamark.frontend.two_view import triangulate
 from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
+MAX_PENDING = 4
 TRIANGULATION_PX = 2.0
 RELATIVE_SIGMA = 0.2  # a landmark whose depth is less sure than this is not worth keeping
 
@@ -63,7 +64,12 @@ class KeyframeBuilder:
         return request
 
     def submit(self, requests: Sequence[KeyframeRequest]) -> None:
-        """Queue requests that belong together: two for the first map of a mono session, else one."""
+        """Queue requests that belong together: two for the first map of a mono session, else one.
+
+        Waits for the oldest when MAX_PENDING are under way: images in a queue are memory without bound.
+        """
+        while len(self._pending) >= MAX_PENDING:
+            self._collect()
         self._pending.append(self._pool.submit(self._make_all, list(requests)))
 
     def take(self) -> tuple[Keyframe, ...]:

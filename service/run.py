@@ -7,7 +7,6 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import MapSnapshot
@@ -23,7 +22,7 @@ from seamark.service.recorder import NullRecorder, Recorder, RerunRecorder
 from seamark.service.requests import Empty, Status
 from seamark.service.results import write_files
 from seamark.service.sources.base import Source, SourceError, Unreadable
-from seamark.service.types import KeyframeSummary, RunRecord
+from seamark.service.types import KeyframeSummary, ProcessUsage, RunRecord
 
 MAP_FILE = "map.seamark"
 RECORDING_FILE = "run.rrd"
@@ -141,8 +140,8 @@ def _run_nodes(
             nodes.bus.request(topics.DRAIN[node], Empty(), DRAIN_TIMEOUT_S)
         wall_s = time.monotonic() - started
         snapshot: MapSnapshot = nodes.bus.request(topics.MAP_SNAPSHOT, Empty())
-        stages_ms = _stages(nodes)
-        usage = nodes.stop()
+        statuses = {node: nodes.bus.request(topics.STATUS[node], Empty()) for node in topics.NODES}
+        usage = _usage(nodes.stop(), statuses)
 
         record = RunRecord(
             sources=options.sources,
@@ -151,9 +150,9 @@ def _run_nodes(
             keyframes=_keyframes(output.staging / MAP_FILE, recorder),
             snapshot=snapshot,
             ground_truth=source.ground_truth,
-            processes=(*usage, own_usage()),
+            processes=usage,
             wall_s=wall_s,
-            stages_ms=stages_ms,
+            stages_ms=_stages(statuses),
             deterministic=options.in_process,
         )
         recorder.finish(record)
@@ -239,25 +238,30 @@ class Pace:
             time.sleep(due - now)
 
 
-def _stages(nodes: Nodes) -> dict[str, list[float]]:
-    stages: dict[str, list[float]] = {}
-    for node in topics.NODES:
-        status: Status = nodes.bus.request(topics.STATUS[node], Empty())
-        for stage, latencies in status.stages_ms.items():
-            stages[f"{node}.{stage}"] = latencies
-    return stages
+def _stages(statuses: dict[str, Status]) -> dict[str, list[float]]:
+    return {
+        f"{node}.{stage}": latencies
+        for node, status in statuses.items()
+        for stage, latencies in status.stages_ms.items()
+    }
+
+
+def _usage(ended: tuple[ProcessUsage, ...], statuses: dict[str, Status]) -> tuple[ProcessUsage, ...]:
+    """Return what all processes have used: CPU time from their end, memory from what they said of themselves.
+
+    The kernel's own peak of a child starts with the memory of the parent that it was forked from.
+    """
+    nodes = [ProcessUsage(one.name, statuses[one.name].peak_rss_bytes, one.cpu_s) for one in ended]
+    return (*nodes, own_usage())
 
 
 def _keyframes(map_path: Path, recorder: Recorder) -> tuple[KeyframeSummary, ...]:
     """Read the keyframes back from the finished map, and show them to the recorder."""
     summaries = []
-    store: Any = MapStore(map_path)
-    try:
+    with MapStore(map_path, read_only=True) as store:
         for keyframe in store.load_keyframes():
             recorder.keyframe(keyframe)
             summaries.append(
                 KeyframeSummary(keyframe.id, keyframe.session, keyframe.index, keyframe.stamp_ns, keyframe.file)
             )
-    finally:
-        store.close()
     return tuple(summaries)
