@@ -39,7 +39,9 @@ class VerificationConfig(_Section):
     covariance_inflation: float = Field(
         default=4.0, ge=1, description="factor on a pose's covariance: landmarks err too"
     )
-    rotation_floor_deg: float = Field(default=0.1, gt=0, description="least standard deviation of a loop's rotation")
+    rotation_floor_deg: float = Field(
+        default=0.3, gt=0, description="least sigma of a loop's rotation: rolling shutters and calibrations err too"
+    )
     translation_floor_fraction: float = Field(
         default=0.01, gt=0, description="least standard deviation of a loop's translation per median depth"
     )
@@ -87,7 +89,7 @@ class ConsistencyConfig(_Section):
         default=22.46, gt=0, description="largest chi squared of a loop against odometry (6 dof, 99.9 %)"
     )
     pair_chi2: float = Field(
-        default=16.81, gt=0, description="largest chi squared of a cycle of two loops (6 dof, 99 %)"
+        default=22.46, gt=0, description="largest chi squared of a cycle of two loops (6 dof, 99.9 %)"
     )
     strong_inliers: int = Field(
         default=60, ge=6, description="inliers that accept a loop that nothing contradicts alone"
@@ -108,7 +110,7 @@ class GraphConfig(_Section):
     """The pose graph and its solver."""
 
     cauchy_width: float = Field(
-        default=2.0, gt=0, description="width of the robust kernel of loops in standard deviations"
+        default=1.0, gt=0, description="width of the robust kernel of loops in standard deviations"
     )
     prior_sigma: float = Field(default=1e-3, ge=1e-4, description="standard deviation of the first pose (rad, m)")
     relinearise_threshold: float = Field(

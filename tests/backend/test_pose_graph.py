@@ -43,7 +43,7 @@ def two_laps(seed, keyframes=200, radius=10.0, bias_deg=0.03, scale_bias=0.006, 
     for k in range(keyframes):
         if k:
             step = np.linalg.inv(truth[k - 1]) @ truth[k]
-            noise = exp(rng.normal(0, 1e-3, 3) + (0, 0, np.deg2rad(bias_deg)), rng.normal(0, 5e-3, 3))
+            noise = exp(np.deg2rad([0, 0, bias_deg]) + rng.normal(0, 1e-3, 3), rng.normal(0, 5e-3, 3))
             step[:3, 3] *= (1 + scale_bias) * np.exp(scale_drift * k)
             odometry.append(odometry[-1] @ step @ noise)
         previous = first_id + k - 1 if k else None
@@ -243,7 +243,7 @@ def test_bad_input_is_named():
 
 
 def test_solver_process_survives_kill_and_gives_the_same():
-    """Test: kill -9 of the child, twice. Expected: the same poses as in-process, revisions go on, errors come through."""
+    """Test: kill -9 of the child, twice. Expected: poses as in-process, revisions go on, errors come through."""
     truth, nodes = two_laps(13, keyframes=60)
     graph, solver = PoseGraph(CONFIG), SolverProcess(CONFIG)
     try:

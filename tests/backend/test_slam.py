@@ -127,7 +127,7 @@ def weakened(keyframe, keep, rng):
 
 def test_a_weak_loop_waits_for_a_second_one(world, move):
     """Test: few features in the second lap. Expected: the first loop waits, the second confirms both."""
-    truth, keyframes, _ = ring(world, move)
+    _truth, keyframes, _ = ring(world, move)
     rng = np.random.default_rng(0)
     keyframes = [weakened(k, 70, rng) if k.id >= LAP else k for k in keyframes]
     slam = make_slam()
@@ -257,7 +257,7 @@ def test_places_need_motion_along_or_many_inliers(world, move):
 
 
 def test_restored_slam_goes_on_as_before(world, move):
-    truth, keyframes, _ = ring(world, move)
+    _truth, keyframes, _ = ring(world, move)
     slam = make_slam()
     for keyframe in keyframes[:50]:
         ids = [keyframe.id - LAP] if keyframe.id >= LAP else []
