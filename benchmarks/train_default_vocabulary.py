@@ -4,6 +4,9 @@
 
 About twelve CPU minutes on one core. The same versions of numpy, OpenCV and faiss make the same file. Nothing here may
 ever read a photograph: what the vocabulary is judged on, it has never seen.
+
+What limits it is the imagery, not the clustering: 16k descriptors drawn at random from the same images serve real ones
+as well as their k-means (gardens_point recall@1 .72 against .69, kitti06, euroc and hololens neighbours alike).
 """
 
 import argparse

@@ -8,7 +8,6 @@ import pytest
 
 import seamark.vocab
 from seamark.frontend.features import extract_features, thumbnail_of
-from seamark.vocab.config import VocabConfig
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import PlaceObservation
 from seamark.vocab.vocabulary import Vocabulary
@@ -45,7 +44,10 @@ def test_hardly_a_word_is_there_twice(vocabulary: Vocabulary) -> None:
 
 @pytest.mark.real_data
 def test_photographs_of_one_place_find_each_other(vocabulary: Vocabulary) -> None:
-    """Every 20th place of a walk, seen again from the other side of the path: at least 7 of 10 first, chance is 1."""
+    """Every tenth place of a walk, seen again from the other side of the path: 15 of 20 among the first three at least.
+
+    Chance would find 3.
+    """
     if not PHOTOGRAPHS.is_dir():
         pytest.skip(f"REAL DATA MISSING: {PHOTOGRAPHS} is not there, so the vocabulary was not tried on photographs")
 
@@ -56,9 +58,10 @@ def test_photographs_of_one_place_find_each_other(vocabulary: Vocabulary) -> Non
         key = 1000 * session + number
         return PlaceObservation(key, session, number, features.descriptors, features.points, thumbnail_of(image, 96))
 
-    index = PlaceIndex(vocabulary, VocabConfig(histogram_weight=0.0))
-    places = range(0, 200, 20)
+    index = PlaceIndex(vocabulary)
+    places = range(0, 200, 10)
     for number in places:
         index.add(observe("day_left", number, 0))
-    found = sum(index.query(observe("day_right", number, 1)).ranked[0].id == number for number in places)
-    assert 7 <= found <= 10
+    answers = {number: index.query(observe("day_right", number, 1), limit=3) for number in places}
+    found = sum(number in [candidate.id for candidate in answer.ranked] for number, answer in answers.items())
+    assert 15 <= found <= 20
