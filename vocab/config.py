@@ -31,7 +31,7 @@ class VocabConfig(BaseModel):
     exclude_recent_count_places: int = Field(
         default=20,
         ge=0,
-        description="Takes the place of both in mode places, where stamps are a running index and say nothing of motion.",
+        description="Takes the place of both in mode places, where stamps are a running index and tell no motion.",
     )
     votes_weight: float = Field(default=1.0, ge=0.0, description="Weight of the visual words in the score.")
     histogram_weight: float = Field(default=0.1, ge=0.0, description="Weight of the colour histograms in the score.")

@@ -17,9 +17,9 @@ class InvertedIndex:
     A place is a vector of weights, sqrt(count) * idf for each word, divided by their sum; the similarity of two is the
     sum of the smaller weights, 1 - |p - q|_1 / 2, which is 1 for equal places and 0 for places without a common word
     (Nister and Stewenius, CVPR 2006). The square root tempers words that come in bursts (Jegou et al., CVPR 2009).
-    L1 was measured against the cosine on gardens_point, recall@1/@10 with the weights of the default vocabulary: .69/.98
-    against .58/.91 for plain counts and .68/.98 for their roots. Weights from the index's own document frequencies gave
-    .71/.96 and are left out: so a score depends on two images alone, and rankings of shards merge exactly.
+    L1 was measured against the cosine on gardens_point, recall@1/@10 with the weights of the default vocabulary:
+    .69/.98 against .58/.91 for plain counts and .68/.98 for their roots. Weights from the index's own document
+    frequencies gave .71/.96 and are left out: so a score depends on two images alone, and rankings of shards merge.
 
     Postings lie in blocks of 32 from one pool; the blocks of a word are a chain, newest first, and only the newest may
     be partly filled. Adding, voting and removing are numpy operations over all words of a place at once. A place has a
