@@ -32,10 +32,11 @@ types: setup
 contracts: setup
 	$(VENV)/bin/lint-imports
 
-# For developers of Seamark: needs uv. The lock names no host; hashes guard what is downloaded.
+# For developers of Seamark: needs uv. The locks name no host; hashes guard what is downloaded.
+COMPILE := uv pip compile --quiet --universal --python-version 3.11 --no-header --no-annotate --generate-hashes
 lock:
-	uv pip compile --quiet --universal --python-version 3.11 --group sim --group dev --no-header --no-annotate \
-	    --generate-hashes pyproject.toml -o requirements.lock
+	$(COMPILE) --group sim --group dev pyproject.toml -o requirements.lock
+	$(COMPILE) pyproject.toml -c requirements.lock -o docker/requirements.lock
 
 messages: setup
 	$(VENV)/bin/python -m grpc_tools.protoc -I service --python_out=service --pyi_out=service service/messages.proto
