@@ -1,4 +1,9 @@
-"""A mild model of an RGB-D camera, and how its frames are coded on disk and between processes."""
+"""Models of RGB-D cameras, and how their frames are coded on disk and between processes.
+
+The slowly varying relative error of depth over the image is that of A. Teichman, S. Miller, S. Thrun, "Unsupervised
+intrinsic calibration of depth sensors via SLAM", RSS 2013; the noise that grows with the square of depth that of any
+triangulating sensor.
+"""
 
 from dataclasses import dataclass
 
@@ -13,10 +18,34 @@ from seamark.frontend.types import Frame
 DEPTH_FACTOR = 5000.0  # raw units per metre, as in the TUM RGB-D sets
 DEPTH_STEP_M = 0.001  # cheap depth cameras give whole millimetres
 DEPTH_RANGE_M = (0.3, 8.0)
-DEPTH_NOISE_PER_M = 0.001  # standard deviation = this times z squared: 1 mm at 1 m, 16 mm at 4 m
 DEPTH_NOISE_CELL_PX = 4
-IMAGE_NOISE_GREY = 2.0
+DISTORTION_CELLS = (4, 5)
+DISTORTION_AT_M = 4.0
 JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How good a camera is.
+
+    ``image_noise_grey`` is a standard deviation; ``depth_noise_per_m`` times z squared is that of depth: 0.001 is 1 mm
+    at 1 m and 16 mm at 4 m. ``depth_distortion`` is the standard deviation over the image of the relative error of depth
+    at 4 m, the same in all frames and proportional to depth, with a mean of zero.
+    """
+
+    image_noise_grey: float
+    depth_noise_per_m: float
+    depth_distortion: float
+
+    def distortion_field(self, height: int, width: int, seed: int) -> NDArray[np.float32]:
+        """Return the relative error of depth (H, W) at DISTORTION_AT_M of one camera."""
+        cells = np.random.default_rng([seed, 0xD157]).standard_normal(DISTORTION_CELLS, np.float32)
+        smooth = cv2.resize(cells, (width, height), interpolation=cv2.INTER_CUBIC)
+        field: NDArray[np.float32] = (smooth - smooth.mean()) / smooth.std() * np.float32(self.depth_distortion)
+        return field
+
+
+MODELS = {"mild": SensorModel(2.0, 0.001, 0.0), "cheap": SensorModel(5.0, 0.003, 0.012)}
 
 
 @dataclass(frozen=True)
@@ -29,20 +58,23 @@ class CodedFrame:
     depth: bytes = b""
 
 
-def expose(colour: NDArray[np.float32], rng: np.random.Generator) -> Image:
+def expose(colour: NDArray[np.float32], model: SensorModel, rng: np.random.Generator) -> Image:
     """Return what the sensor reads of BGR light (H, W, 3) in 0..255: uint8 with noise."""
-    return to_image(colour + np.float32(IMAGE_NOISE_GREY) * rng.standard_normal(colour.shape, np.float32))
+    return to_image(colour + np.float32(model.image_noise_grey) * rng.standard_normal(colour.shape, np.float32))
 
 
-def measure_depth(depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
-    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: noise growing with z squared, whole mm, 0 out of range.
+def measure_depth(
+    depth: NDArray[np.float32], distortion: NDArray[np.float32], model: SensorModel, rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: distorted, noise growing with z squared, whole mm, 0 out of range.
 
     The noise is alike over DEPTH_NOISE_CELL_PX pixels, because such cameras match windows and not single pixels.
     """
     height, width = depth.shape
     cells = rng.standard_normal((height // DEPTH_NOISE_CELL_PX + 1, width // DEPTH_NOISE_CELL_PX + 1), np.float32)
     smooth = cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR)
-    noisy = depth + np.float32(1.5 * DEPTH_NOISE_PER_M) * depth**2 * smooth  # linear interpolation leaves 1 / 1.5
+    per_square = distortion / np.float32(DISTORTION_AT_M) + np.float32(1.5 * model.depth_noise_per_m) * smooth
+    noisy = depth + depth**2 * per_square  # 1.5, because linear interpolation leaves 1 / 1.5 of the noise
     steps = np.rint(noisy / np.float32(DEPTH_STEP_M))
     near, far = DEPTH_RANGE_M
     raw = np.where((depth >= near) & (noisy >= near) & (noisy <= far), steps * (DEPTH_STEP_M * DEPTH_FACTOR), 0)

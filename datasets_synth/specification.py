@@ -38,6 +38,7 @@ class Specification:
     sensors: str = Mode.RGBD.value
     size: str = "full"
     image: str = "640x480"
+    sensor: str = "mild"
 
     @property
     def mode(self) -> Mode:
@@ -87,6 +88,7 @@ PARSERS: dict[str, Callable[[str, str], str | int]] = {
     "sensors": _choice(tuple(mode.value for mode in SENSORS)),
     "size": _choice(SIZES),
     "image": _choice(tuple(IMAGES)),
+    "sensor": _choice(tuple(sensor.MODELS)),
 }
 
 

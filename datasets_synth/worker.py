@@ -52,13 +52,17 @@ def _render(job: dict[str, Any], output: BinaryIO) -> None:
     cv2.setNumThreads(1)
     specification = Specification(**job["specification"])
     poses = specification.poses()
+    model, camera = sensor.MODELS[specification.sensor], specification.rig.cam0
+    distortion = model.distortion_field(camera.height, camera.width, specification.seed)
     renderer = Renderer(specification.build(), specification.rig)
     for index in range(job["first"], specification.frames, job["step"]):
         colour, depth, right_colour = renderer.render(poses[index])
         rng = np.random.default_rng([specification.seed, index, 0x5E])
-        left = sensor.code_picture(sensor.expose(colour, rng))
-        right = b"" if right_colour is None else sensor.code_picture(sensor.expose(right_colour, rng))
-        raw = sensor.code_depth(sensor.measure_depth(depth, rng)) if specification.mode is Mode.RGBD else b""
+        left = sensor.code_picture(sensor.expose(colour, model, rng))
+        right = b"" if right_colour is None else sensor.code_picture(sensor.expose(right_colour, model, rng))
+        raw = b""
+        if specification.mode is Mode.RGBD:
+            raw = sensor.code_depth(sensor.measure_depth(depth, distortion, model, rng))
         output.write(HEADER.pack(index, len(left), len(right), len(raw)))
         for blob in (left, right, raw):
             output.write(blob)

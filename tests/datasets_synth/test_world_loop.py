@@ -5,7 +5,7 @@ import pytest
 
 from seamark import SeamarkError
 from seamark.datasets_synth import specification, trajectory, world_loop
-from seamark.datasets_synth.sensor import CodedFrame, code_depth, code_picture, decode, measure_depth
+from seamark.datasets_synth.sensor import MODELS, CodedFrame, code_depth, code_picture, decode, measure_depth
 from seamark.frontend import se3
 
 
@@ -44,14 +44,25 @@ class TestPath:
 class TestSensor:
     def test_depth_noise_grows_with_the_square_of_the_distance(self) -> None:
         for metres in (1.0, 2.0, 4.0):
-            raw = measure_depth(np.full((240, 320), metres, np.float32), np.random.default_rng(0))
+            plane = np.full((240, 320), metres, np.float32)
+            raw = measure_depth(plane, np.zeros_like(plane), MODELS["mild"], np.random.default_rng(0))
             error = raw / 5000 - metres
             assert error.std() == pytest.approx(np.hypot(0.001 * metres**2, 0.001 / 12**0.5), rel=0.12)
             assert abs(error.mean()) < 0.1 * error.std() + 1e-5
 
+    def test_a_cheap_camera_errs_in_the_same_way_in_all_frames(self) -> None:
+        model, plane = MODELS["cheap"], np.full((240, 320), 3.0, np.float32)
+        field = model.distortion_field(240, 320, seed=1)
+        assert field.std() == pytest.approx(0.012, rel=0.01)
+        assert abs(field.mean()) < 1e-4
+        frames = [measure_depth(plane, field, model, np.random.default_rng(k)) / 5000 for k in range(40)]
+        assert np.abs(np.mean(frames, axis=0) / 3 - 1 - field * 3 / 4).mean() < 0.002
+        assert np.abs(np.diff(field, axis=1)).max() < 0.002
+        assert not MODELS["mild"].distortion_field(240, 320, seed=1).any()
+
     def test_depth_out_of_range_is_zero(self) -> None:
         depth = np.array([[0.0, 0.2, 0.5, 7.5, 9.0, 30.0]], np.float32).repeat(16, axis=0)
-        raw = measure_depth(depth, np.random.default_rng(0))
+        raw = measure_depth(depth, np.zeros_like(depth), MODELS["mild"], np.random.default_rng(0))
         assert np.array_equal(raw[0] > 0, [False, False, True, True, False, False])
 
     def test_broken_files_are_errors(self) -> None:
