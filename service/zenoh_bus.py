@@ -21,7 +21,7 @@ from seamark.service.bus import (
 from seamark.service.topics import Congestion, Kind, Reliability, Topic
 from seamark.service.wire import WireError, decode, encode, encoding_of
 from seamark.service.zenoh_delivery import Outbox, Reader, pack_stamp, payload_of, unpack_stamp
-from seamark.service.zenoh_serving import Worker, all_done, bounded, on_end, on_reply, server, settle
+from seamark.service.zenoh_serving import Asked, Worker, all_done, bounded, server, settle
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class ZenohBus:
         """Return a Future of the reply."""
         check_kind(topic, Kind.REQUEST)
         payload, future = encode(message), Future[Any]()
-        patience_s = topic.timeout_s if timeout_s is None else timeout_s
+        asked = Asked(topic, future, time.monotonic(), topic.timeout_s if timeout_s is None else timeout_s)
         future.set_running_or_notify_cancel()
         with self._lock:
             self._check_open()
@@ -108,13 +108,13 @@ class ZenohBus:
             self._session.get(
                 topic.key(self._namespace),
                 zenoh.handlers.Callback(
-                    lambda reply: replies.submit(lambda: on_reply(topic, future, reply, patience_s)),
-                    drop=lambda: replies.submit(lambda: on_end(topic, future)),
+                    lambda reply: replies.submit(lambda: asked.on_reply(reply)),
+                    drop=lambda: replies.submit(asked.on_end),
                     indirect=False,
                 ),
                 payload=payload,
                 encoding=encoding_of(topic.message),
-                timeout=patience_s,
+                timeout=asked.patience_s,
                 congestion_control=CONGESTION[topic.congestion],
             )
         except zenoh.ZError as error:

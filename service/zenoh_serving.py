@@ -3,8 +3,10 @@
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
+from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -23,6 +25,10 @@ from seamark.service.wire import WireError, decode, encode, encoding_of
 from seamark.service.zenoh_delivery import TIMEOUT_PAYLOAD, answer, payload_of, refusal, refuse
 
 logger = logging.getLogger(__name__)
+
+# A router keeps time as well and may end a query a little before the asker's own timer does, without a word: what ends
+# after this part of the time without a reply has timed out.
+TIMED_OUT_FRACTION = 0.9
 
 
 class Worker:
@@ -120,27 +126,40 @@ def server(topic: Topic, callback: Handler) -> Callable[[Any], None]:
     return process
 
 
-def on_reply(topic: Topic, future: "Future[Any]", reply: Any, timeout_s: float) -> None:
-    """Settle the Future of a request by a reply or an error reply."""
-    if reply.ok is None:
-        payload = reply.err.payload.to_bytes()
-        timed_out = payload == TIMEOUT_PAYLOAD
-        late = TimedOutError(f"no reply on topic {topic.name} in {timeout_s:g} s")
-        settle(future, late if timed_out else refusal(payload))
-        return
-    assert topic.reply is not None
-    try:
-        content: object = decode(payload_of(reply.ok), topic.reply)
-    except WireError as error:
-        settle(future, error)
-    else:
-        with contextlib.suppress(InvalidStateError):
-            future.set_result(content)
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A request on its way: its Future, and since when (time.monotonic) and for how long it waits, in seconds."""
 
+    topic: Topic
+    future: "Future[Any]"
+    since_s: float
+    patience_s: float
 
-def on_end(topic: Topic, future: "Future[Any]") -> None:
-    """Settle the Future of a request that has ended without any reply."""
-    settle(future, UnavailableError(f"nobody serves topic {topic.name}, or its node died while it worked"))
+    def on_reply(self, reply: Any) -> None:
+        """Settle the Future by a reply or an error reply."""
+        if reply.ok is None:
+            payload = reply.err.payload.to_bytes()
+            settle(self.future, self._timed_out() if payload == TIMEOUT_PAYLOAD else refusal(payload))
+            return
+        assert self.topic.reply is not None
+        try:
+            content: object = decode(payload_of(reply.ok), self.topic.reply)
+        except WireError as error:
+            settle(self.future, error)
+        else:
+            with contextlib.suppress(InvalidStateError):
+                self.future.set_result(content)
+
+    def on_end(self) -> None:
+        """Settle the Future of a request that has ended without any reply."""
+        if time.monotonic() - self.since_s >= TIMED_OUT_FRACTION * self.patience_s:
+            settle(self.future, self._timed_out())
+        else:
+            name = self.topic.name
+            settle(self.future, UnavailableError(f"nobody serves topic {name}, or its node died while it worked"))
+
+    def _timed_out(self) -> TimedOutError:
+        return TimedOutError(f"no reply on topic {self.topic.name} in {self.patience_s:g} s")
 
 
 def settle(future: "Future[Any]", error: BusError | WireError) -> None:
