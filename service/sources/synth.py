@@ -56,7 +56,8 @@ class SynthSource:
         """Yield all frames in order, made ahead in one thread; closing the iterator ends a rendering."""
         made = self.sequence.frames()
         try:
-            for frame in ahead(lambda _: next(made, None), range(self.n_frames)):
+            # One more than there are: only when asked beyond its end does a rendering put itself into the cache.
+            for frame in ahead(lambda _: next(made, None), range(self.n_frames + 1)):
                 if frame is None:
                     return
                 yield self._seen(frame)
