@@ -29,8 +29,8 @@ class SensorModel:
     """How good a camera is.
 
     ``image_noise_grey`` is a standard deviation; ``depth_noise_per_m`` times z squared is that of depth: 0.001 is 1 mm
-    at 1 m and 16 mm at 4 m. ``depth_distortion`` is the standard deviation over the image of the relative error of depth
-    at 4 m, the same in all frames and proportional to depth, with a mean of zero.
+    at 1 m and 16 mm at 4 m. ``depth_distortion`` is the standard deviation over the image of the relative error of
+    depth at 4 m, the same in all frames and proportional to depth, with a mean of zero.
     """
 
     image_noise_grey: float
@@ -45,7 +45,7 @@ class SensorModel:
         return field
 
 
-MODELS = {"mild": SensorModel(2.0, 0.001, 0.0), "cheap": SensorModel(5.0, 0.003, 0.012)}
+MODELS = {"mild": SensorModel(2.0, 0.001, 0.0), "cheap": SensorModel(5.0, 0.003, 0.03)}
 
 
 @dataclass(frozen=True)

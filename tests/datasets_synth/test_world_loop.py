@@ -53,11 +53,11 @@ class TestSensor:
     def test_a_cheap_camera_errs_in_the_same_way_in_all_frames(self) -> None:
         model, plane = MODELS["cheap"], np.full((240, 320), 3.0, np.float32)
         field = model.distortion_field(240, 320, seed=1)
-        assert field.std() == pytest.approx(0.012, rel=0.01)
+        assert field.std() == pytest.approx(0.03, rel=0.01)
         assert abs(field.mean()) < 1e-4
         frames = [measure_depth(plane, field, model, np.random.default_rng(k)) / 5000 for k in range(40)]
         assert np.abs(np.mean(frames, axis=0) / 3 - 1 - field * 3 / 4).mean() < 0.002
-        assert np.abs(np.diff(field, axis=1)).max() < 0.002
+        assert np.abs(np.diff(field, axis=1)).max() < 0.004
         assert not MODELS["mild"].distortion_field(240, 320, seed=1).any()
 
     def test_depth_out_of_range_is_zero(self) -> None:
