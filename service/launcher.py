@@ -13,11 +13,14 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
 
+import psutil
+
 from seamark.service.bus import BusError
+from seamark.service.nodes.meter import usage_of
 from seamark.service.nodes.process import write_settings
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty, Status
-from seamark.service.topics import BACKEND, FRONTEND, NODES, RUNNER, STATUS, VOCAB
+from seamark.service.topics import BACKEND, FRONTEND, KEYFRAME, NODES, PROGRESS, RUNNER, VOCAB
 from seamark.service.types import ProcessUsage
 from seamark.service.zenoh_bus import ZenohBus
 from seamark.service.zenoh_session import Watch, free_endpoint, open_session
@@ -28,6 +31,8 @@ START_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 30.0
 KILL_TIMEOUT_S = 5.0
 MAX_RESTARTS = 3
+# More keyframes than a front end can have announced without having handed them over.
+LOST_KEYFRAMES = 4 * KEYFRAME.depth
 # One thread per process and library: OpenCV, BLAS and OpenMP would otherwise fight for the same cores.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
@@ -195,7 +200,9 @@ class Launcher:
             _, status, usage = os.wait4(child.process.pid, 0)
             child.exit_code = child.process.returncode = os.waitstatus_to_exitcode(status)
             child.last_word = lines[-1] if lines else f"exit code {child.exit_code}"
-            child.peak_rss_bytes, child.cpu_s = 1024 * usage.ru_maxrss, usage.ru_utime + usage.ru_stime
+            # The kernel's maximum begins with what this process had when it started the child: an upper bound only.
+            child.peak_rss_bytes = child.peak_rss_bytes or 1024 * usage.ru_maxrss
+            child.cpu_s = usage.ru_utime + usage.ru_stime
             self._ended.append(child)
             self._children.pop(child.name, None)
             if self._watch is not None:
@@ -215,25 +222,28 @@ class Launcher:
         logger.warning("%s; it is started again", sentence)
         self._settings = replace(self._settings, restore=self._settings.map_path is not None)
         if child.name == FRONTEND:
-            self._counting_on()
+            self._counting_on(LOST_KEYFRAMES)
         with self._lock:
             if self._stopping:
                 return
             self.restarts[child.name] += 1
             self._start(child.name, self._settings)
 
-    def _counting_on(self) -> None:
-        """Let the next front end go on counting after the keyframes that were sent."""
+    def _counting_on(self, margin: int = 0) -> None:
+        """Let the next front end go on counting after all keyframes that the last one has sent.
+
+        Keyframes that it had announced in its odometry and not yet sent are lost; their numbers are not used again.
+        """
         keyframe_id, session = self._settings.first_keyframe_id, self._settings.first_session
         for node in (VOCAB, BACKEND):
             try:
-                status: Status = self.bus.request(STATUS[node], Empty())
+                status: Status = self.bus.request(PROGRESS[node], Empty())
             except BusError as error:
                 logger.warning("the %s node does not say how far it is: %s", node, error)
                 continue
             keyframe_id = max(keyframe_id, status.counters.get("next_keyframe_id", 0))
             session = max(session, status.counters.get("next_session", 0))
-        self._settings = replace(self._settings, first_keyframe_id=keyframe_id, first_session=session)
+        self._settings = replace(self._settings, first_keyframe_id=keyframe_id + margin, first_session=session)
 
     def _stop_child(self, name: str, timeout_s: float) -> None:
         with self._lock:
@@ -241,6 +251,8 @@ class Launcher:
         if child is None:
             return
         started = time.monotonic()
+        with contextlib.suppress(psutil.Error):
+            child.peak_rss_bytes = usage_of(child.process.pid)[1]
         self._signal(child, signal.SIGTERM)
         if not child.ended.wait(timeout_s):
             logger.warning("%s has not stopped after %.0f s and is killed", name, time.monotonic() - started)

@@ -218,6 +218,22 @@ STATUS = {
     for node in NODES
 }
 
+PROGRESS = {
+    node: Topic(
+        f"progress_{node}",
+        f"progress/{node}",
+        Kind.REQUEST,
+        Empty,
+        RUNNER,
+        (node,),
+        2,
+        f"As status, but answered by the {node} node only after all that was sent to it before.",
+        reply=Status,
+        timeout_s=60.0,
+    )
+    for node in (VOCAB, BACKEND)
+}
+
 #: All topics, in the order of the documentation.
 TOPICS: tuple[Topic, ...] = (
     FRAME,
@@ -232,6 +248,7 @@ TOPICS: tuple[Topic, ...] = (
     PLACES_RANK,
     *DRAIN.values(),
     *STATUS.values(),
+    *PROGRESS.values(),
 )
 
 

@@ -59,6 +59,7 @@ class BackendNode:
         place_service = PlaceService(places, camera, self._rank, slam.locate)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
+        bus.handle(topics.PROGRESS[bus.node], lambda _: self._meter.status())
         bus.handle(topics.MAP_SNAPSHOT, lambda _: self._slam.snapshot(), workers=1)
         bus.handle(topics.PLACE, place_service.answer, workers=PLACE_WORKERS)
         bus.handle(topics.CANDIDATES, self._on_candidates)

@@ -53,13 +53,13 @@ class Meter:
         with self._lock:
             counters = dict(self._counters)
             stages_ms = {stage: list(values) for stage, values in self._stages_ms.items()}
-        rss_bytes, peak_rss_bytes, cpu_s = _usage()
+        rss_bytes, peak_rss_bytes, cpu_s = usage_of(os.getpid())
         return Status(self._node, os.getpid(), rss_bytes, peak_rss_bytes, cpu_s, counters, stages_ms)
 
 
-def _usage() -> tuple[int, int, float]:
-    """Return RSS, peak RSS and CPU seconds of this process, with its largest child and all children's time."""
-    process = psutil.Process()
+def usage_of(process_id: int) -> tuple[int, int, float]:
+    """Return RSS, peak RSS in bytes and CPU seconds of a process, with its largest child and all children's time."""
+    process = psutil.Process(process_id)
     times = process.cpu_times()
     cpu_s = times.user + times.system + times.children_user + times.children_system
     child_rss, child_peak = 0, 0

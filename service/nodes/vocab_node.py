@@ -35,6 +35,7 @@ class VocabNode:
             self._remember(observation)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
+        bus.handle(topics.PROGRESS[bus.node], lambda _: self._meter.status())
         bus.handle(topics.PLACES_RANK, self._on_rank, workers=1)
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 

@@ -18,6 +18,8 @@ class FakeNode:
     def __init__(self, bus: Bus, settings: NodeSettings) -> None:
         self._bus, self._settings = bus, settings
         bus.handle(topics.STATUS[bus.node], lambda _: self._status())
+        if bus.node in topics.PROGRESS:
+            bus.handle(topics.PROGRESS[bus.node], lambda _: self._status())
         if bus.node == topics.FRONTEND:
             bus.handle(topics.FRAME, self._on_frame)
 

@@ -14,7 +14,7 @@ import pytest
 from seamark.frontend.types import Frame, Mode
 from seamark.service import launcher as launcher_module
 from seamark.service.bus import BusError, UnavailableError
-from seamark.service.launcher import Launcher, NodeFailedError
+from seamark.service.launcher import LOST_KEYFRAMES, Launcher, NodeFailedError
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty
 from seamark.service.topics import BACKEND, FRAME, FRONTEND, NODES, STATUS, VOCAB
@@ -74,7 +74,7 @@ def test_a_killed_node_is_replaced_and_goes_on_counting(tmp_path: Path) -> None:
 
         def answers() -> bool:
             try:
-                return bool(launcher.bus.request(STATUS[FRONTEND], Empty()).counters["first"] == 7)
+                return bool(launcher.bus.request(STATUS[FRONTEND], Empty()).counters["first"] == 7 + LOST_KEYFRAMES)
             except BusError:
                 return False
 
