@@ -126,6 +126,8 @@ class GraphConfig(_Section):
 class PlacesConfig(_Section):
     """Mode places: when a recognised place counts without poses."""
 
+    candidates: int = Field(default=10, ge=1, description="how many candidates are verified per image")
+    island_images: int = Field(default=10, ge=0, description="of places this near to each other only the best counts")
     strong_inliers: int = Field(default=60, ge=9, description="inliers that accept a place alone")
     window_queries: int = Field(default=3, ge=1, description="how many images back or ahead can confirm a place")
     slack_images: int = Field(

@@ -148,17 +148,28 @@ class Slam:
 
     def _verify(self, keyframe: Keyframe, candidates: Candidates) -> list[tuple[Candidate, Verification | Rejected]]:
         """Compare the keyframe with the best candidate of each island."""
+        verified = []
+        for candidate in self._islands(candidates, self._map.keyframes, keyframe):
+            match, seed = self._map.keyframes[candidate.id], self._pair_seed(keyframe.id, candidate.id)
+            verified.append((candidate, verify(keyframe, match, self._config.verification, seed)))
+        return verified if self._solver is not None else self._best_of_islands(verified)
+
+    def _best_of_islands(
+        self, verified: list[tuple[Candidate, Verification | Rejected]]
+    ) -> list[tuple[Candidate, Verification | Rejected]]:
+        """Without poses a place is the image nearest to where the query was taken: its neighbours, which see much
+        the same with fewer inliers, are refused as INCONSISTENT with it.
+        """
+        radius = self._config.places.island_images
+        best: list[int] = []
+        for candidate, result in sorted(verified, key=lambda pair: -pair[1].inliers):
+            if isinstance(result, Verification) and all(abs(candidate.id - other) > radius for other in best):
+                best.append(candidate.id)
         return [
-            (
-                candidate,
-                verify(
-                    keyframe,
-                    self._map.keyframes[candidate.id],
-                    self._config.verification,
-                    self._pair_seed(keyframe.id, candidate.id),
-                ),
-            )
-            for candidate in self._islands(candidates, self._map.keyframes, keyframe)
+            (candidate, result)
+            if isinstance(result, Rejected) or candidate.id in best
+            else (candidate, Rejected(Reason.INCONSISTENT, result.inliers, result.matches))
+            for candidate, result in verified
         ]
 
     def _islands(
@@ -166,6 +177,9 @@ class Slam:
     ) -> list[Candidate]:
         """Return the best candidate of each island of neighbouring keyframes; the recent past is none."""
         config = self._config.verification
+        count, radius = config.candidates, config.island_keyframes
+        if self._solver is None:  # a place is an image: all are compared, see _best_of_islands
+            count, radius = self._config.places.candidates, 0
         chosen: list[Candidate] = []
         for candidate in candidates.ranked:
             match = known.get(candidate.id)
@@ -174,13 +188,10 @@ class Slam:
             recent = keyframe is not None and keyframe.session == match.session
             if recent and keyframe is not None and abs(keyframe.id - match.id) < config.min_gap_keyframes:
                 continue
-            near = (
-                abs(other.id - match.id) <= config.island_keyframes and known[other.id].session == match.session
-                for other in chosen
-            )
+            near = (abs(other.id - match.id) <= radius and known[other.id].session == match.session for other in chosen)
             if not any(near):
                 chosen.append(candidate)
-            if len(chosen) == config.candidates:
+            if len(chosen) == count:
                 break
         return chosen
 

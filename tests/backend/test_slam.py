@@ -256,6 +256,19 @@ def test_places_need_motion_along_or_many_inliers(world, move):
     assert place.T_map_cam is None
 
 
+def test_of_neighbouring_places_only_the_best_counts(world, move):
+    """Test: an image sees three neighbouring places and a far one. Expected: the same index, nothing beside it."""
+    _, keyframes, _ = ring(world, move)
+    bare = [replace(k, camera=None, T_odom_cam=None, covariance=None) for k in keyframes]
+    slam = make_slam(Mode.PLACES)
+    for keyframe in bare[:40]:
+        slam.step(keyframe, candidates(keyframe.id))
+    loops = {loop.match_id: loop for loop in slam.step(bare[40], candidates(40, 11, 12, 10, 9, 25)).loops}
+    assert {m for m, loop in loops.items() if loop.accepted} == {10}
+    assert {loops[m].reason for m in (9, 11)} == {Reason.INCONSISTENT}
+    assert set(loops) == {9, 10, 11, 12, 25}
+
+
 def test_restored_slam_goes_on_as_before(world, move):
     _truth, keyframes, _ = ring(world, move)
     slam = make_slam()
