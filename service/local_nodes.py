@@ -1,20 +1,25 @@
 """The three nodes in one process and one thread, for tests and for runs that are the same to the bit."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import psutil
 
-from seamark.service.bus import LocalBus
+from seamark.service.bus import Bus, LocalBus
 from seamark.service.nodes import backend_node, frontend_node, vocab_node
 from seamark.service.nodes.process import Node
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.topics import NODES, RUNNER
 from seamark.service.types import ProcessUsage
 
-BUILDERS = {"frontend": frontend_node.build, "vocab": vocab_node.build, "backend": backend_node.build}
+BUILDERS: dict[str, Callable[[Bus, NodeSettings], Node]] = {
+    "frontend": frontend_node.build,
+    "vocab": vocab_node.build,
+    "backend": backend_node.build,
+}
 
 
 class LocalNodes:

@@ -258,7 +258,7 @@ def _usage(ended: tuple[ProcessUsage, ...], statuses: dict[str, Status]) -> tupl
 def _keyframes(map_path: Path, recorder: Recorder) -> tuple[KeyframeSummary, ...]:
     """Read the keyframes back from the finished map, and show them to the recorder."""
     summaries = []
-    with MapStore(map_path, read_only=True) as store:
+    with MapStore(map_path) as store:  # not read_only: that would leave SQLite's side files behind
         for keyframe in store.load_keyframes():
             recorder.keyframe(keyframe)
             summaries.append(
