@@ -22,6 +22,7 @@ from seamark.service.topics import Congestion, Kind, Reliability, Topic
 from seamark.service.wire import WireError, decode, encode, encoding_of
 from seamark.service.zenoh_delivery import Outbox, Reader, pack_stamp, payload_of, unpack_stamp
 from seamark.service.zenoh_serving import Asked, Worker, all_done, bounded, server, settle
+from seamark.service.zenoh_session import Watch
 
 logger = logging.getLogger(__name__)
 
@@ -55,9 +56,11 @@ class ZenohBus:
         self._ordered: Worker | None = None
         self._replies: Worker | None = None
         self._subscriber_threads: list[threading.Thread] = []
-        self._pending: set[Future[Any]] = set()
+        self._pending: dict[Future[Any], str] = {}  # and who was asked
         self._closed = False
         self._dropped: dict[str, int] = {}
+        # A query on its way to a node that is just being killed can be lost without an end before its timeout.
+        self._watch = Watch(session, namespace, self._on_change)
 
     @property
     def node(self) -> str:
@@ -102,8 +105,8 @@ class ZenohBus:
         with self._lock:
             self._check_open()
             replies = self._replies = self._replies or Worker(f"{self._node}-replies")
-            self._pending.add(future)
-        future.add_done_callback(self._pending.discard)
+            self._pending[future] = topic.readers[0]
+        future.add_done_callback(lambda done: self._pending.pop(done, None))
         try:
             self._session.get(
                 topic.key(self._namespace),
@@ -180,6 +183,7 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
+        self._watch.close()
         for declared in self._declared:
             declared.undeclare()
         for outbox in self._outboxes.values():  # before the workers, which may be waiting for room in a window
@@ -198,6 +202,15 @@ class ZenohBus:
             declared.undeclare()
         if self._replies is not None:
             self._replies.close()
+
+    def _on_change(self, node: str, came: bool) -> None:
+        """End requests that a node took with it when it died, and send again what it has not acknowledged."""
+        for (_, reader), outbox in list(self._outboxes.items()):
+            if reader == node:
+                outbox.reader_changed(came)
+        for future, asked in list(self._pending.items()):
+            if asked == node and not came:
+                settle(future, UnavailableError(f"the {node} node died while it worked"))
 
     def _check_open(self) -> None:
         if self._closed:

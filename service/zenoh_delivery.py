@@ -128,6 +128,10 @@ class Outbox:
             self._events.put(lambda: self._items.append(item))
         return item.done
 
+    def reader_changed(self, came: bool) -> None:
+        """Take note that the reader has died, or is there again and need not be waited for any longer."""
+        self._events.put(self._on_reader_came if came else self._on_reader_gone)
+
     def drain(self, deadline: float) -> None:
         """Wait until nothing is outstanding; raises TimedOutError, BusClosedError, or the first refusal."""
         with self._room:
@@ -206,6 +210,12 @@ class Outbox:
     def _on_end(self, item: _Item, generation: int) -> None:
         if not item.answered:
             self._go_back(generation, "no reader")
+
+    def _on_reader_gone(self) -> None:
+        self._go_back(self._generation, "the reader has died")
+
+    def _on_reader_came(self) -> None:
+        self._resume_at = 0.0
 
     def _on_answer(self, item: _Item, error: RemoteError | None) -> None:
         if item.answered:
