@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
 from seamark import SeamarkError, __version__
 
@@ -16,6 +17,7 @@ from seamark import SeamarkError, __version__
 
 EXIT_ERROR = 1
 EXIT_INTERRUPTED = 130
+TABLE_WIDTH = 140
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 app = typer.Typer(
@@ -52,6 +54,13 @@ def _config(path: Path | None, overrides: list[str] | None, seed: int | None) ->
 
     extra = [] if seed is None else [f"seed={seed}"]
     return load_config(path, os.environ, [*(overrides or []), *extra])
+
+
+def _print_table(table: Table) -> None:
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=TABLE_WIDTH)  # a pipe has no width that a column should bow to
+    console.print(table)
 
 
 def _print_json(value: object) -> None:
@@ -122,7 +131,7 @@ def run_command(
     if as_json:
         _print_json(report)
     else:
-        Console(highlight=False).print(report_table(report))
+        _print_table(report_table(report))
         sys.stdout.write(f"results: {out}\n")
 
 
@@ -141,7 +150,7 @@ def demo_command(out: OutFolder = Path("demo"), as_json: JsonOption = False, ove
         return
     if shown.notice:
         sys.stdout.write(shown.notice + "\n")
-    Console(highlight=False).print(report_table(report))
+    _print_table(report_table(report))
     for what, name in (("picture", shown.picture.name), ("recording", "run.rrd"), ("report", "report.json")):
         sys.stdout.write(f"{what + ':':<11}{out / name}\n")
     sys.stdout.write(f"look at it: {Path(sys.executable).parent / 'rerun'} {out / 'run.rrd'}\n")
@@ -214,7 +223,7 @@ def query_command(
     if as_json:
         _print_json(query.as_json(reply))
     elif reply.error_code is None:
-        Console(highlight=False).print(query.table(reply))
+        _print_table(query.table(reply))
     if reply.error_code is not None:
         raise query.QueryError(f"{reply.error_code}: {reply.error_message}")
 
@@ -233,7 +242,7 @@ def eval_command(
     if as_json:
         _print_json(result)
     else:
-        Console(highlight=False).print(evaluation_report.table(result))
+        _print_table(evaluation_report.table(result))
 
 
 @vocab_app.command("train")
