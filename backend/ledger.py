@@ -62,7 +62,10 @@ class PoseRelation:
 
 
 class PlaceRelation:
-    """Without poses nothing contradicts; places that move along with the images that see them support each other."""
+    """Places that move along with the images that see them support each other.
+
+    Neighbouring images that see neighbouring places but do not move along contradict each other; all else agrees.
+    """
 
     def __init__(self, config: PlacesConfig) -> None:
         self._config = config
@@ -74,7 +77,8 @@ class PlaceRelation:
         match_moved = np.array([other.match_id - finding.match_id for other in others])
         near = (np.abs(moved) > 0) & (np.abs(moved) <= self._config.window_queries)
         along = np.minimum(np.abs(match_moved - moved), np.abs(match_moved + moved)) <= self._config.slack_images
-        return np.ones(len(others), bool), near & along
+        same_island = np.abs(match_moved) <= self._config.island_images
+        return ~near | along | ~same_island, near & along
 
 
 class LoopLedger:
