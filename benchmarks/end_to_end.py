@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from seamark.frontend import se3
 from seamark.service.sources.open import open_sources
 from seamark.service.stamps import parse_stamp
@@ -29,10 +30,16 @@ RUNS: dict[str, list[str]] = {
     "gardens_point places": ["{data}/gardens_point/day_left", "{data}/gardens_point/day_right", "--mode", "places"],
     "synth:loop rgbd": ["synth:loop"],
     "synth:loop rgbd, weak odometry": ["synth:loop", *WEAK],
-    "synth:loop rgbd, cheap camera": ["synth:loop,camera=cheap"],
+    "synth:loop rgbd, cheap camera": ["synth:loop,sensor=cheap"],
     "synth:loop stereo": ["synth:loop,sensors=stereo"],
     "synth:loop mono": ["synth:loop", "--mode", "mono"],
 }
+
+
+COLUMNS = (
+    *("run", "tracked", "sessions", "m", "ATE odometry m", "ATE corrected m", "loops +/-"),
+    *("accepted loops against the truth", "frame ms p50/p95/p99", "frames/s", "CPU ms/frame", "peak MiB f v b r"),
+)
 
 
 def run(name: str, words: list[str]) -> dict[str, Any]:
@@ -100,21 +107,26 @@ def row(name: str, words: list[str]) -> str:
     loops, frames, latency = report["loops"], report["frames"], report["latency_ms"]["frame"]
     memory = " ".join(f"{p['name'][0]}{p['peak_rss_bytes'] // 2**20}" for p in report["processes"])
     cpu = 1e3 * sum(p["cpu_s"] for p in report["processes"]) / frames["total"]
-    return (
-        f"| {name} | {frames['tracked']}/{frames['total']} | {len(report['sessions'])} | {length} | {before} | {after} |"
-        f" {loops['accepted']}/{loops['rejected']} | {loop_errors(report, words)} |"
-        f" {latency['p50']:.0f}/{latency['p95']:.0f}/{latency['p99']:.0f} | {report['frames_per_second']:.1f} | {cpu:.0f} |"
-        f" {memory} |"
+    cells = (
+        name,
+        f"{frames['tracked']}/{frames['total']}",
+        len(report["sessions"]),
+        length,
+        before,
+        after,
+        f"{loops['accepted']}/{loops['rejected']}",
+        loop_errors(report, words),
+        f"{latency['p50']:.0f}/{latency['p95']:.0f}/{latency['p99']:.0f}",
+        f"{report['frames_per_second']:.1f}",
+        f"{cpu:.0f}",
+        memory,
     )
+    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def main() -> None:
     data, names = sys.argv[1], sys.argv[2:] or list(RUNS)
-    print(
-        "| run | tracked | sessions | m | ATE odometry m | ATE corrected m | loops +/- | accepted loops against the truth |"
-        " frame ms p50/p95/p99 | frames/s | CPU ms/frame | peak MiB f v b r |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|")
     for name in names:
         words = [word.format(data=data) for word in RUNS[name]]
         print(row(name, words), flush=True)

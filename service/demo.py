@@ -11,7 +11,7 @@ from seamark.service.run import Progress, RunOptions, run
 from seamark.service.sources.open import open_sources
 from seamark.service.types import RunRecord
 
-WORLD = "synth:loop"
+WORLD = "synth:loop,sensor=cheap"
 KEPT = "synth:small_loop"
 PICTURE = "demo.png"
 

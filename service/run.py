@@ -243,6 +243,7 @@ def _stages(statuses: dict[str, Status]) -> dict[str, list[float]]:
         f"{node}.{stage}": latencies
         for node, status in statuses.items()
         for stage, latencies in status.stages_ms.items()
+        if node != topics.FRONTEND  # its stages come with every frame
     }
 
 

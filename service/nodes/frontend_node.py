@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -50,6 +51,7 @@ class FrontendNode:
         self._frontend.close()
 
     def _on_frame(self, received: Frame | EncodedFrame) -> Odometry:
+        started = time.perf_counter()
         with self._lock, self._meter.timed("frame"):
             try:
                 frame = decode_frame(received)
@@ -59,6 +61,7 @@ class FrontendNode:
                 result = self._frontend.step(frame)
                 odometry = self._shift_odometry(result.odometry)
                 self._send(result.keyframes)
+            odometry = replace(odometry, latency_ms=1e3 * (time.perf_counter() - started))
             self._bus.publish(topics.ODOMETRY, odometry)
         self._meter.count("frames")
         self._meter.count(f"frames_{odometry.outcome}")
