@@ -131,7 +131,7 @@ class PlacesConfig(_Section):
     strong_inliers: int = Field(default=60, ge=9, description="inliers that accept a place alone")
     window_queries: int = Field(default=3, ge=1, description="how many images back or ahead can confirm a place")
     slack_images: int = Field(
-        default=3, ge=0, description="how far matches may deviate from moving along with the queries"
+        default=2, ge=0, description="how far matches may deviate from moving along with the queries"
     )
     min_support: int = Field(default=1, ge=1, description="neighbouring queries with matching places that confirm one")
 
