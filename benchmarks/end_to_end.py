@@ -1,6 +1,6 @@
 """All the runs that docs/benchmarks.md reports, by hand:  .venv/bin/python benchmarks/end_to_end.py DATA [NAME...]
 
-DATA is the folder with the real sequences. Prints a Markdown table and leaves the results of every run in build/benchmarks.
+DATA is the folder with the real sequences. Prints a Markdown table and leaves the results in build/benchmarks.
 """
 
 import csv

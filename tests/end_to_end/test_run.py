@@ -101,12 +101,12 @@ def test_places_without_calibration(toy_tum: Path, n_frames: int, tmp_path: Path
     assert report["keyframes"] == n_frames
     assert (out / "trajectory.tum").read_text() == "# stamp tx ty tz qx qy qz qw\n"
     accepted = [loop for loop in rows(out / "loops.csv") if loop["accepted"] == "1"]
-    lap = n_frames / 1.08
+    lap = n_frames / 1.08  # one image per second
     assert len(accepted) >= 3
-    for loop in accepted:
-        apart = float(loop["query_stamp"]) - float(loop["match_stamp"])  # one image per second
-        assert abs(apart - lap) <= 12, loop
-        assert loop["tx"] == loop["qw"] == ""
+    off = [abs(float(loop["query_stamp"]) - float(loop["match_stamp"]) - lap) for loop in accepted]
+    assert max(off) <= 20  # 60 degrees of the circle at most: the same wall is in view
+    assert np.median(off) <= 6
+    assert all(loop["tx"] == loop["qw"] == "" for loop in accepted)
 
 
 @pytest.mark.real_data
