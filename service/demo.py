@@ -31,7 +31,7 @@ def demonstrate(out: Path, config: SeamarkConfig, progress: Progress | None = No
     try:
         source, spec = open_sources([WORLD]), WORLD
     except NoVulkanDevice as error:
-        notice = f"{error} The small sequence that comes with Seamark is used instead."
+        notice = f"Nothing can be rendered here, so the small sequence that comes with Seamark is used ({error})."
         spec = KEPT
         source = open_sources([spec])
     record = run(source, RunOptions(out, sources=(spec,)), config, progress)
