@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.frontend import se3, tracker
+from seamark.frontend.admission import refusal
 from seamark.frontend.camera import CalibrationError
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import NoDepth, make_depth_sensor
@@ -57,8 +58,8 @@ class Frontend:
     ) -> None:
         if mode is not Mode.PLACES and rig is None:
             raise CalibrationError(f"mode {mode} needs a calibration")
-        if mode is Mode.STEREO and (rig is None or rig.cam1 is None):
-            raise CalibrationError("mode stereo needs a calibration of both cameras")
+        if mode is Mode.STEREO:
+            _check_pair(rig)
         self._rig, self._mode, self._config, self._clock = rig, mode, config, clock
         self._sensor = make_depth_sensor(rig, mode, config) if rig is not None else NoDepth()
         self._builder = KeyframeBuilder(rig, mode, config, self._sensor)
@@ -71,9 +72,9 @@ class Frontend:
 
     def step(self, frame: Frame) -> FrontendResult:
         """Process one frame; frames come in the order of their stamps."""
-        refusal = self._refuse(frame)
-        if refusal is not None:
-            odometry = report(frame, refusal, Quality.LOST)
+        refused = self._refuse(frame)
+        if refused is not None:
+            odometry = report(frame, refused, Quality.LOST)
         elif self._mode is Mode.PLACES:
             odometry = self._place(frame)
         else:
@@ -91,8 +92,9 @@ class Frontend:
 
     def _refuse(self, frame: Frame) -> Outcome | None:
         """Return why a frame cannot be used, or None and take its stamp as the newest."""
-        if self._rig is not None and frame.image.shape[:2] != (self._rig.cam0.height, self._rig.cam0.width):
-            return Outcome.WRONG_SIZE
+        outcome = refusal(frame, self._rig, self._mode)
+        if outcome is not None:
+            return outcome
         last = self._last_stamp_ns
         if last is not None and frame.stamp_ns <= last:
             return Outcome.REPEATED_STAMP if frame.stamp_ns == last else Outcome.STAMP_BACKWARD
@@ -257,6 +259,17 @@ class Frontend:
             keyframe_id=keyframe_id,
             tracks=arrows,
             stages_ms=stages_ms,
+        )
+
+
+def _check_pair(rig: Rig | None) -> None:
+    """Raise CalibrationError unless there are two cameras between whose images flow can be followed."""
+    if rig is None or rig.cam1 is None:
+        raise CalibrationError("mode stereo needs a calibration of both cameras")
+    left, right = rig.cam0, rig.cam1
+    if (left.width, left.height) != (right.width, right.height):
+        raise CalibrationError(
+            f"mode stereo needs images of one size, not {left.width} x {left.height} and {right.width} x {right.height}"
         )
 
 

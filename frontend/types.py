@@ -50,8 +50,8 @@ class Outcome(StrEnum):
     NEW_SESSION = "new_session"  # the first frame of a session
     LOST = "lost"
     PLACE = "place"  # mode places: a keyframe without a pose
-    UNREADABLE = "unreadable"  # missing, truncated or undecodable file
-    WRONG_SIZE = "wrong_size"  # the image contradicts the calibration
+    UNREADABLE = "unreadable"  # missing, truncated or undecodable file, or a picture of a wrong type
+    WRONG_SIZE = "wrong_size"  # an image contradicts the calibration, or depth its image
     REPEATED_STAMP = "repeated_stamp"
     STAMP_BACKWARD = "stamp_backward"
 
