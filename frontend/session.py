@@ -116,8 +116,7 @@ class Session:
         self._landmarks_from_depth()  # after the adjustment: they hang on this keyframe's pose alone
         self.T_odom_cam = self.reference.T_odom_cam
         self.n_at_keyframe = int(np.isfinite(self.landmarks.get(self.tracks.ids)[:, 0]).sum())
-        oldest = min((int(k.track_ids[0]) for k in self.window if len(k.track_ids)), default=self.next_track_id)
-        self.landmarks.forget_before(oldest)
+        self.landmarks.retain(np.concatenate([k.track_ids for k in self.window]))
 
     def _landmarks_from_depth(self) -> None:
         newest = self.reference

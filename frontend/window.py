@@ -157,37 +157,32 @@ def _solve(
 
 
 class LandmarkTable:
-    """Positions (3,) in the odometry frame by track id, NaN where unknown; ids only grow and old ones are forgotten."""
+    """Positions (3,) in the odometry frame by track id, NaN where unknown; as long as what it is told to keep."""
 
     def __init__(self) -> None:
-        self._first_id = 0
-        self._positions = np.full((1024, 3), np.nan)
+        self._ids = np.zeros(0, np.int64)  # ascending
+        self._positions = np.zeros((0, 3))
+
+    def __len__(self) -> int:
+        """Return the number of ids that are held, unknown positions included."""
+        return len(self._ids)
 
     def get(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return positions (N, 3); forgotten and new ids are NaN."""
-        index = track_ids - self._first_id
-        known = (index >= 0) & (index < len(self._positions))
         out = np.full((len(track_ids), 3), np.nan)
-        out[known] = self._positions[index[known]]
+        if len(self._ids):
+            index = np.minimum(np.searchsorted(self._ids, track_ids), len(self._ids) - 1)
+            held = self._ids[index] == track_ids
+            out[held] = self._positions[index[held]]
         return out
 
     def set(self, track_ids: NDArray[np.int64], positions: NDArray[np.float64]) -> None:
-        """Store positions (N, 3)."""
-        if len(track_ids) == 0:
-            return
-        needed = int(track_ids.max()) - self._first_id + 1
-        if needed > len(self._positions):
-            grown = np.full((max(needed, 2 * len(self._positions)), 3), np.nan)
-            grown[: len(self._positions)] = self._positions
-            self._positions = grown
-        index = track_ids - self._first_id
-        self._positions[index[index >= 0]] = positions[index >= 0]
+        """Store positions (N, 3) of different ids."""
+        ids = np.concatenate([track_ids, self._ids])
+        self._ids, first = np.unique(ids, return_index=True)  # of an id that is held the new position comes first
+        self._positions = np.vstack([positions, self._positions])[first]
 
-    def forget_before(self, track_id: int) -> None:
-        """Drop everything below an id."""
-        drop = track_id - self._first_id
-        if drop > 4096:
-            self._positions = (
-                self._positions[drop:].copy() if drop < len(self._positions) else np.full((1024, 3), np.nan)
-            )
-            self._first_id = track_id
+    def retain(self, track_ids: NDArray[np.int64]) -> None:
+        """Forget all ids but these: one track that lives for ever must not keep all that came after it."""
+        kept = np.isin(self._ids, track_ids)
+        self._ids, self._positions = self._ids[kept], self._positions[kept]

@@ -5,7 +5,9 @@ import pytest
 
 from seamark.frontend import se3
 from seamark.frontend.camera import CalibrationError, Camera, Rig
+from seamark.frontend.config import FrontendConfig
 from seamark.frontend.pose import Observations, estimate_pose, pose_jacobian, residuals_and_jacobian, retract
+from seamark.frontend.session import Session
 from seamark.frontend.two_view import initialise, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, adjust
 
@@ -161,11 +163,28 @@ def test_window_moves_poses_and_landmarks_to_the_truth() -> None:
     assert 0.15 < np.median(result.errors_px) < 0.6
 
 
-def test_landmark_table_forgets_old_ids_only() -> None:
+def test_landmark_table_holds_what_it_is_told_to_keep() -> None:
     table = LandmarkTable()
+    assert np.isnan(table.get(np.array([0, 7]))).all()
     ids = np.arange(20_000)
     table.set(ids, np.column_stack([ids, ids, ids]).astype(float))
-    table.forget_before(15_000)
-    assert np.isnan(table.get(np.array([3, 14_999])))[:, 0].all()
-    np.testing.assert_array_equal(table.get(np.array([15_000, 19_999]))[:, 0], [15_000, 19_999])
-    assert np.isnan(table.get(np.array([10**9]))).all()
+    table.set(np.array([15_000, 3]), np.array([[1.0, 2, 3], [4, 5, 6]]))
+    table.retain(np.array([3, 15_000, 19_999, 50_000]))
+    np.testing.assert_array_equal(table.get(np.array([19_999, 3, 15_000]))[:, 0], [19_999, 4, 1])
+    assert np.isnan(table.get(np.array([4, 14_999, 50_000, 10**9]))).all()
+    assert len(table) == 3
+
+
+def test_a_track_that_never_ends_does_not_make_a_session_grow() -> None:
+    """Test: dirt on the lens is tracked for 80 keyframes, all else for 3. Expected: the state stays bounded."""
+    session = Session(0, FrontendConfig(), CAMERA, True, np.eye(4))
+    rng = np.random.default_rng(6)
+    for k in range(80):
+        session.tracks = session.tracks[(session.tracks.ids == 0) | (session.tracks.ids > 40 * (k - 3))]
+        session.new_tracks(rng.uniform(0, 480, (40, 2)).astype(np.float32))
+        depth = np.full(len(session.tracks), np.nan)
+        depth[1:] = 0.5
+        session.insert_keyframe(k, k, np.eye(4), depth, np.full(len(depth), 0.01))
+    assert session.tracks.ids[0] == 0
+    assert session.next_track_id == 3200
+    assert 100 < len(session.landmarks) < 800
