@@ -51,6 +51,7 @@ class Slam:
         self._ledger = LoopLedger(relation, config.consistency.compared_loops, config.consistency.clique_starts)
         self._map = MapState()
         self._loops: dict[Key, Loop] = {}
+        self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
         self._lock = threading.Lock()
 
     def __contains__(self, keyframe_id: int) -> bool:
@@ -71,14 +72,13 @@ class Slam:
         # Gate by odometry, then judge by mutual consistency with all loops so far.
         started = time.perf_counter()
         changed: dict[Key, None] = {}
-        was_accepted = {key for key, loop in self._loops.items() if loop.accepted}
         for candidate, result in verified:
             changed |= dict.fromkeys(self._enter(keyframe, candidate, result))
         timings_ms["consistency"] = 1e3 * (time.perf_counter() - started)
 
         # Commit what is accepted, withdraw what no longer is, and solve.
         started = time.perf_counter()
-        optimised = self._commit([key for key in changed if self._loops[key].accepted != (key in was_accepted)])
+        optimised = self._commit([key for key in changed if self._loops[key].accepted != (key in self._committed)])
         timings_ms["optimise"] = 1e3 * (time.perf_counter() - started)
         return StepResult(tuple(self._loops[key] for key in changed), self._map.revision, optimised, timings_ms)
 
@@ -240,13 +240,16 @@ class Slam:
         """Bring the graph in line with these loops' verdicts; return whether it was solved."""
         if not keys:
             return False
+        accepted = {key for key in keys if self._loops[key].accepted}
+        self._committed.difference_update(keys)
+        self._committed |= accepted
         if self._solver is None:
             with self._lock:
                 self._map.revision += 1
             return False
         for key in keys:
             constraint = self._ledger.finding(key).constraint
-            if self._loops[key].accepted and constraint is not None:
+            if key in accepted and constraint is not None:
                 self._solver.add_loop(constraint)
             else:
                 self._solver.remove_loop(*key)

@@ -51,6 +51,7 @@ class BackendNode:
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
         self._known: set[int] = set()
+        self._next_keyframe_id = 0
         self._next_session = 0
         self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
         self._candidates: dict[int, tuple[Candidates, Future[None]]] = {}
@@ -103,8 +104,9 @@ class BackendNode:
 
     def _remember(self, keyframe: Keyframe) -> None:
         self._known.add(keyframe.id)
+        self._next_keyframe_id = max(self._next_keyframe_id, keyframe.id + 1)
         self._next_session = max(self._next_session, keyframe.session + 1)
-        self._meter.keep("next_keyframe_id", max(self._known) + 1)
+        self._meter.keep("next_keyframe_id", self._next_keyframe_id)
         self._meter.keep("next_session", self._next_session)
 
     def _on_keyframe(self, keyframe: Keyframe) -> None:
