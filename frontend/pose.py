@@ -86,7 +86,10 @@ def estimate_pose(
     inliers[indices.reshape(-1)] = True
     covariance = np.eye(6)
     for _ in range(2):
-        T_odom_cam, covariance = refine_pose(T_odom_cam, observations[inliers], camera, pixel_sigma=pixel_sigma)
+        try:
+            T_odom_cam, covariance = refine_pose(T_odom_cam, observations[inliers], camera, pixel_sigma=pixel_sigma)
+        except np.linalg.LinAlgError:  # landmarks on one line leave the rotation about it open
+            return None
         errors, in_front = reprojection_errors(T_odom_cam, observations.landmarks, observations.pixels, camera)
         inliers = in_front & (errors < threshold_px)
         if inliers.sum() < minimum:
@@ -156,7 +159,10 @@ def robust_weights(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
 def refine_pose(
     T_odom_cam: NDArray[np.float64], observations: Observations, camera: Camera, *, pixel_sigma: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Minimise robust pixel and inverse-depth errors over the pose; return it with its covariance (6, 6)."""
+    """Minimise robust pixel and inverse-depth errors over the pose; return it with its covariance (6, 6).
+
+    Raises numpy.linalg.LinAlgError when the landmarks do not determine the pose.
+    """
     T = T_odom_cam
     H: NDArray[np.float64] = np.eye(6)
     for _ in range(ITERATIONS):

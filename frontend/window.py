@@ -75,7 +75,11 @@ def adjust(problem: BundleProblem, camera: Camera, *, pixel_sigma: float, iterat
     starts = np.flatnonzero(np.diff(problem.landmark_of, prepend=-1))
     current = _linearise(problem, poses, landmarks, camera, pixel_sigma)
     for _ in range(iterations):
-        step = _solve(problem, current, starts, damping)
+        try:
+            step = _solve(problem, current, starts, damping)
+        except np.linalg.LinAlgError:  # a landmark or pose that nothing determines: hold it more firmly
+            damping *= 10
+            continue
         trial_poses = np.stack([retract(T, d) for T, d in zip(poses, step[0], strict=True)])
         trial_landmarks = landmarks + step[1]
         trial = _linearise(problem, trial_poses, trial_landmarks, camera, pixel_sigma)

@@ -94,6 +94,23 @@ def test_no_pose_from_rubbish() -> None:
     assert estimate_pose(observations[np.arange(3)], CAMERA, **settings) is None
 
 
+def singular(*_: object, **__: object) -> None:
+    raise np.linalg.LinAlgError("Singular matrix")
+
+
+def test_landmarks_that_do_not_determine_a_pose_give_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test: the normal equations are singular, as landmarks on a line can make them. Expected: no pose, no exception.
+
+    Once in some hundred lines rounding leaves an exact zero, so the solver is made to say so here.
+    """
+    points = scene(np.random.default_rng(0))
+    observations = Observations(points, see(np.eye(4), points), unknown(120), unknown(120))
+    settings = {"threshold_px": 2.5, "iterations": 150, "pixel_sigma": 0.7, "minimum": 15}
+    assert estimate_pose(observations, CAMERA, **settings) is not None
+    monkeypatch.setattr(np.linalg, "solve", singular)
+    assert estimate_pose(observations, CAMERA, **settings) is None
+
+
 def test_triangulation_finds_points_and_refuses_those_behind() -> None:
     rng = np.random.default_rng(3)
     points = scene(rng, 20)
@@ -136,7 +153,7 @@ def test_pure_rotation_starts_no_map() -> None:
     assert isinstance(turned, str)
 
 
-def test_window_moves_poses_and_landmarks_to_the_truth() -> None:
+def window_problem() -> tuple[BundleProblem, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(5)
     points = scene(rng)
     true = np.stack([se3.make(se3.exp_rotation([0, 0.02 * k, 0]), np.array([0.25 * k, 0, 0])) for k in range(5)])
@@ -155,12 +172,25 @@ def test_window_moves_poses_and_landmarks_to_the_truth() -> None:
         landmark_of[order],
         Observations(np.zeros((600, 3)), pixels[order], depths[order], np.full(600, 0.002)),
     )
+    return problem, true, points
+
+
+def test_window_moves_poses_and_landmarks_to_the_truth() -> None:
+    problem, true, points = window_problem()
     result = adjust(problem, CAMERA, pixel_sigma=0.3, iterations=12)
     np.testing.assert_array_equal(result.poses[0], true[0])
     error = np.linalg.norm(result.poses[:, :3, 3] - true[:, :3, 3], axis=1)
     assert 0 < error[1:].max() < 0.01
     assert np.linalg.norm(result.landmarks - points, axis=1).mean() < 0.05
     assert 0.15 < np.median(result.errors_px) < 0.6
+
+
+def test_window_stays_as_it_is_where_it_cannot_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, *_ = window_problem()
+    monkeypatch.setattr(np.linalg, "solve", singular)
+    result = adjust(problem, CAMERA, pixel_sigma=0.3, iterations=12)
+    np.testing.assert_allclose(result.poses, problem.poses, atol=1e-12)
+    np.testing.assert_array_equal(result.landmarks, problem.landmarks)
 
 
 def test_landmark_table_holds_what_it_is_told_to_keep() -> None:
