@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.frontend import se3
+from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import DepthSensor
 from seamark.frontend.features import extract_features, match_descriptors, thumbnail_of
@@ -126,12 +127,17 @@ class KeyframeBuilder:
             landmarks=self._landmarks(frame, features),
             thumbnail=thumbnail_of(frame.image, c.thumbnail_px),
             jpeg=jpeg.tobytes(),
-            camera=self._rig.cam0 if self._rig else None,
+            camera=self._camera_of(frame),
             previous_id=request.previous_id,
             T_odom_cam=request.T_odom_cam,
             covariance=request.covariance,
             metric=self._mode is not Mode.MONO,
         )
+
+    def _camera_of(self, frame: Frame) -> Camera | None:
+        """Return the calibration if it is for images of this size: in mode places there may be others."""
+        camera = None if self._rig is None else self._rig.cam0
+        return camera if camera is not None and (camera.height, camera.width) == frame.image.shape[:2] else None
 
     def _landmarks(self, frame: Frame, features: Features) -> NDArray[np.float32]:
         unknown = np.full((len(features), 3), np.nan, np.float32)

@@ -49,8 +49,9 @@ class Frontend:
     """Visual odometry and keyframes of one camera.
 
     One code path serves mono, stereo and RGB-D; they differ in the depth sensor. Mode ``PLACES`` makes every frame a
-    keyframe without a pose. Raises CalibrationError when the mode needs what the rig does not have. ``clock`` (seconds)
-    measures stages for the report and decides nothing.
+    keyframe without a pose; there a calibration holds for images of its size, others are taken as without. Raises
+    CalibrationError when the mode needs what the rig does not have. ``clock`` (seconds) measures stages for the report
+    and decides nothing.
     """
 
     def __init__(

@@ -248,6 +248,14 @@ def test_places_makes_every_frame_a_keyframe_without_a_pose() -> None:
     assert all(o.T_odom_cam is None and o.outcome is Outcome.PLACE for o in odometry)
 
 
+def test_in_mode_places_a_calibration_holds_for_images_of_its_size() -> None:
+    """Test: an image of another size among calibrated ones. Expected: a keyframe too, but without a camera."""
+    frames, _ = walk("loop", 2, Mode.MONO, of=160)
+    odometry, keyframes = track(Mode.PLACES, [frames[0], smaller(frames[1])])
+    assert [o.outcome for o in odometry] == [Outcome.PLACE] * 2
+    assert [k.camera for k in keyframes] == [WORLD.camera, None]
+
+
 def test_modes_need_their_calibration() -> None:
     with pytest.raises(CalibrationError, match="calibration"):
         Frontend(None, Mode.MONO, CONFIG)
