@@ -146,8 +146,9 @@ class Odometry:
     ``T_odom_cam`` is None when there is no pose. ``T_reference_cam`` is the same pose in the frame of keyframe
     ``reference_id``, from which the map's pose follows: ``T_map_reference @ T_reference_cam``. ``session`` is -1 when
     the frame belongs to none. ``covariance`` (6, 6) is of the motion since the reference keyframe. ``filled`` gives
-    poses of earlier frames that became known with this one. ``tracks`` (M, 4) float32 are the inlier tracks (x, y,
-    x_before, y_before) in pixels, for people.
+    poses of earlier frames that became known with this one. ``inliers`` counts landmarks that the pose rests on and
+    ``reprojection_px`` is their median error, NaN where none was measured: no pose, or the first of a session.
+    ``tracks`` (M, 4) float32 are the inlier tracks (x, y, x_before, y_before) in pixels, for people.
     """
 
     index: int

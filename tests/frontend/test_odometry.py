@@ -57,6 +57,8 @@ def test_metric_odometry_follows_a_curve(mode: Mode, bound_m: float) -> None:
     frames, truth = walk("loop", 40, mode, of=160)
     odometry, keyframes = track(mode, frames)
     assert [o.outcome for o in odometry] == [Outcome.NEW_SESSION] + [Outcome.TRACKED] * 39
+    assert np.isnan(odometry[0].reprojection_px)
+    assert all(0 < o.reprojection_px < 1 for o in odometry[1:])
     length = np.linalg.norm(np.diff(truth[:40, :3, 3], axis=0), axis=1).sum()
     assert length > 3
     assert 0 < errors(odometry, truth).max() < bound_m
