@@ -1,6 +1,7 @@
 """Geometric verification: do two keyframes show the same place, and how do their cameras lie to each other?"""
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -121,9 +122,15 @@ def _verify_epipolar(
     if query.camera is not None and match.camera is not None:
         points_query, points_match = query.camera.undistort(points_query), match.camera.undistort(points_match)
         K = (query.camera.K, match.camera.K)
-        model, mask = cv2.findEssentialMat(points_query, points_match, *K, None, None, parameters)
+        fit = partial(cv2.findEssentialMat, points_query, points_match, *K, None, None, parameters)
     else:
-        model, mask = cv2.findFundamentalMat(points_query, points_match, parameters)
+        fit = partial(cv2.findFundamentalMat, points_query, points_match, parameters)
+    try:
+        model, mask = fit()
+    except cv2.error:
+        # OpenCV 5.0 asserts when its last refinement degenerates, as it does for two almost equal images.
+        limits = (config.epipolar_px, config.confidence, config.iterations)
+        model, mask = cv2.findFundamentalMat(points_query, points_match, cv2.FM_RANSAC, *limits)
     if model is None or mask is None or model.shape != (3, 3) or not np.isfinite(model).all():
         return Rejected(Reason.FEW_INLIERS, 0, len(matches))
     inliers = mask.reshape(-1).astype(bool)

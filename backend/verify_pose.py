@@ -64,7 +64,10 @@ def estimate_pose(
         return None
     points, seen = np.ascontiguousarray(landmarks[known]), np.ascontiguousarray(pixels[known])
     parameters = usac_parameters(config.reprojection_px, config, seed)
-    found, _, rotation, translation, _ = cv2.solvePnPRansac(points, seen, camera.K, None, params=parameters)
+    try:
+        found, _, rotation, translation, _ = cv2.solvePnPRansac(points, seen, camera.K, None, params=parameters)
+    except cv2.error:  # OpenCV 5.0 asserts when its last refinement degenerates
+        return None
     if not found:
         return None
     T_camera_other = _from_vectors(rotation, translation)

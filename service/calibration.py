@@ -30,7 +30,7 @@ def _sixteen(value: Any) -> Any:
 class _CalibrationFile(BaseModel):
     """The keys of calib.yaml."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     model: Literal["pinhole"]
     width: int = Field(gt=0)
@@ -105,11 +105,14 @@ def load_kitti_calibration(path: Path, size: tuple[int, int]) -> Rig:
     if "P0" not in projections:
         raise CalibrationError(f"{path} has no row P0")
     P0 = projections["P0"]
-    cam0 = Camera(*size, P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2])
+    try:
+        cam0 = Camera(*size, float(P0[0, 0]), float(P0[1, 1]), float(P0[0, 2]), float(P0[1, 2]))
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
     if "P1" not in projections:
         return Rig(cam0)
     baseline = (P0[0, 3] - projections["P1"][0, 3]) / P0[0, 0]
-    if baseline <= 0:
+    if not 0 < baseline < np.inf:
         raise CalibrationError(f"{path}: P0 and P1 give a baseline of {baseline:g} m; it must be positive")
     return Rig(cam0, cam0, se3.make(np.eye(3), np.array([baseline, 0, 0])))
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -295,6 +296,8 @@ def main() -> None:
 
     0 success, 1 an error that has been said in one sentence, 2 wrong usage, 130 interrupted.
     """
+    # Whoever ends a run with SIGTERM gets the same tidy end as with Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
     except SeamarkError as error:

@@ -65,7 +65,9 @@ def load_config(
         return SeamarkConfig.model_validate(content)
     except ValidationError as error:
         location = dotted(error.errors()[0]["loc"])
-        origin = next((o for key, o in origins.items() if key == location or location.startswith(f"{key}.")), "")
+        origin = next((o for key, o in origins.items() if f"{location}.".startswith(f"{key}.")), "")
+        # An unknown section has no origin of its own, but what lies in it has.
+        origin = origin or next((o for key, o in origins.items() if key.startswith(f"{location}.")), "")
         raise ConfigError(f"{origin}: {sentence(error, SeamarkConfig)}".removeprefix(": ")) from error
 
 
@@ -133,6 +135,8 @@ def _merge(
         here = (*location, str(key))
         if isinstance(value, dict) and isinstance(into.setdefault(str(key), {}), dict):
             _merge(into[str(key)], value, origin, origins, here)
+        elif isinstance(value, dict):
+            continue  # what was a section has been given a value, which will be refused
         else:
             into[str(key)] = value
             origins[dotted(here)] = origin

@@ -216,7 +216,6 @@ class Launcher:
         sentence = f"the {child.name} node has ended: {child.last_word}"
         # An error that it could name would come again; only what was killed or crashed is worth another try.
         if child.exit_code == 1 or self.restarts[child.name] >= self._max_restarts:
-            logger.error("%s", sentence)
             self._failure = NodeFailedError(sentence)
             return
         logger.warning("%s; it is started again", sentence)

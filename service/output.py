@@ -29,10 +29,11 @@ class Output:
     def commit(self) -> None:
         """Move every staged file into the folder, replacing those of an earlier run; raises OutputError."""
         try:
-            for path in sorted(self.staging.iterdir()):
-                target = self.folder / path.name
+            staged = [(path, self.folder / path.name) for path in sorted(self.staging.iterdir())]
+            for _, target in staged:
                 if target.is_dir():
                     raise OutputError(f"{target} is a folder, so the result of that name cannot be written")
+            for path, target in staged:
                 path.replace(target)
             self.staging.rmdir()
         except OSError as error:

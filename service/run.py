@@ -1,25 +1,23 @@
 """`seamark run`: a source through the three nodes, from the first frame to the written results."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import MapSnapshot
-from seamark.frontend.types import Frame, Mode, Odometry, Outcome, Quality
+from seamark.frontend.types import Frame, Mode, Odometry
 from seamark.service import topics
-from seamark.service.bus import Bus, UnavailableError
 from seamark.service.config import SeamarkConfig
+from seamark.service.frame_window import FrameWindow, Nodes, ask
 from seamark.service.launcher import Launcher
 from seamark.service.local_nodes import LocalNodes, own_usage
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.output import Output, prepare_output
 from seamark.service.recorder import NullRecorder, Recorder, RerunRecorder
-from seamark.service.requests import Empty, Status
+from seamark.service.requests import Status
 from seamark.service.results import write_files
 from seamark.service.sources.base import Source, SourceError, Unreadable
 from seamark.service.types import KeyframeSummary, ProcessUsage, RunRecord
@@ -29,7 +27,6 @@ RECORDING_FILE = "run.rrd"
 DRAIN_TIMEOUT_S = 600.0
 
 Progress = Callable[[int, int | None, Odometry], None]
-Nodes = Launcher | LocalNodes
 
 
 @dataclass(frozen=True)
@@ -47,51 +44,6 @@ class RunOptions:
     loops: bool = True
     in_process: bool = False
     realtime: bool = False
-
-
-class FrameWindow:
-    """Frames on their way: at most ``size`` unacknowledged, answered in order, sent again when the front end died."""
-
-    def __init__(self, nodes: Nodes, size: int) -> None:
-        self._nodes, self._size = nodes, size
-        self._pending: deque[tuple[Frame | Unreadable, Future[Odometry] | None]] = deque()
-
-    def push(self, frame: Frame | Unreadable) -> Iterator[tuple[Frame | Unreadable, Odometry]]:
-        """Send a frame and yield those that had to be answered first."""
-        while len(self._pending) >= self._size:
-            yield self._pop()
-        self._pending.append((frame, self._send(frame)))
-
-    def drain(self) -> Iterator[tuple[Frame | Unreadable, Odometry]]:
-        """Yield the rest."""
-        while self._pending:
-            yield self._pop()
-
-    def _send(self, frame: Frame | Unreadable) -> "Future[Odometry] | None":
-        if isinstance(frame, Unreadable):
-            return None
-        bus: Bus = self._nodes.bus
-        future = bus.request_async(topics.FRAME, frame)
-        if isinstance(self._nodes, LocalNodes):
-            self._nodes.bus.pump()
-        return future
-
-    def _pop(self) -> tuple[Frame | Unreadable, Odometry]:
-        while True:
-            frame, future = self._pending[0]
-            if future is None:
-                assert isinstance(frame, Unreadable)
-                odometry = Odometry(frame.index, frame.stamp_ns, frame.file, -1, Quality.LOST, Outcome.UNREADABLE)
-                break
-            try:
-                odometry = future.result()
-                break
-            except UnavailableError:
-                self._nodes.check()
-                self._nodes.wait_until_alive()
-                self._pending = deque((waiting, self._send(waiting)) for waiting, _ in self._pending)
-        self._pending.popleft()
-        return frame, odometry
 
 
 def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Progress | None = None) -> RunRecord:
@@ -137,10 +89,10 @@ def _run_nodes(
         started = time.monotonic()
         odometry = _send_all(source, nodes, options, settings.config, recorder, progress)
         for node in topics.NODES:
-            nodes.bus.request(topics.DRAIN[node], Empty(), DRAIN_TIMEOUT_S)
+            ask(nodes, topics.DRAIN[node], DRAIN_TIMEOUT_S)
         wall_s = time.monotonic() - started
-        snapshot: MapSnapshot = nodes.bus.request(topics.MAP_SNAPSHOT, Empty())
-        statuses = {node: nodes.bus.request(topics.STATUS[node], Empty()) for node in topics.NODES}
+        snapshot: MapSnapshot = ask(nodes, topics.MAP_SNAPSHOT)
+        statuses = {node: ask(nodes, topics.STATUS[node]) for node in topics.NODES}
         usage = _usage(nodes.stop(), statuses)
 
         record = RunRecord(
@@ -196,17 +148,20 @@ def _send_all(
                 progress(len(answered), source.n_frames, odometry)
 
     checked = False
+    reason = ""
     pace = Pace() if options.realtime else None
     for frame in source.frames():
         if isinstance(frame, Frame) and not checked:
             check_size(frame, source)
             checked = True
+        if isinstance(frame, Unreadable):
+            reason = reason or f" ({frame.reason})"
         if pace is not None:
             pace.wait(frame.stamp_ns)
         take(window.push(frame))
     take(window.drain())
     if not checked:
-        raise SourceError(f"{source.name}: not one of {len(answered)} images can be read")
+        raise SourceError(f"{source.name}: not one of {len(answered)} images can be read{reason}")
     return tuple(answered)
 
 
@@ -214,12 +169,15 @@ def check_size(frame: Frame, source: Source) -> None:
     """Raise SourceError if the first image contradicts the calibration; later ones are counted frame by frame."""
     if source.rig is None or source.mode is Mode.PLACES:
         return
-    camera, (height, width) = source.rig.cam0, frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise SourceError(
-            f"{source.name}: {frame.file} has {width} x {height} pixels,"
-            f" but the calibration is for {camera.width} x {camera.height}"
-        )
+    camera = source.rig.cam0
+    pictures = {"": frame.image, "the right image of ": frame.image_right, "the depth image of ": frame.depth}
+    for what, picture in pictures.items():
+        if picture is not None and picture.shape[:2] != (camera.height, camera.width):
+            height, width = picture.shape[:2]
+            raise SourceError(
+                f"{source.name}: {what}{frame.file} has {width} x {height} pixels,"
+                f" but the calibration is for {camera.width} x {camera.height}"
+            )
 
 
 class Pace:

@@ -3,6 +3,8 @@
 from decimal import Decimal, InvalidOperation
 
 NANOSECONDS = 1_000_000_000
+# 146 years: room enough for sums and differences in 64 bits.
+MAX_STAMP_NS = 2**62
 
 
 def format_stamp(stamp_ns: int) -> str:
@@ -14,9 +16,12 @@ def format_stamp(stamp_ns: int) -> str:
 def parse_stamp(text: str) -> int:
     """Return the nanoseconds of a number of seconds in decimal or scientific notation; raises ValueError."""
     try:
-        return int((Decimal(text) * NANOSECONDS).to_integral_value())
+        stamp_ns = int((Decimal(text) * NANOSECONDS).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError) as error:
         raise ValueError(f"{text!r} is not a stamp in seconds") from error
+    if abs(stamp_ns) > MAX_STAMP_NS:
+        raise ValueError(f"{text} s is beyond the stamps that can be told")
+    return stamp_ns
 
 
 def running_stamp(index: int, fps: float) -> int:

@@ -12,6 +12,9 @@ from seamark.service.types import Trajectory
 
 Matrix = NDArray[np.float64]
 
+# Rotations written with few digits are still meant as rotations.
+DETERMINANT_TOLERANCE = 0.01
+
 
 class TrajectoryError(SeamarkError):
     """A file is no trajectory."""
@@ -42,7 +45,7 @@ def load_euroc(path: Path) -> Trajectory:
     values = _numbers(path, rows, 8)
     try:
         stamps = np.array([int(row[0]) for _, row in rows], np.int64)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise TrajectoryError(f"{path}: stamps must be whole nanoseconds ({error})") from error
     return _trajectory(stamps, values[:, 1:4], values[:, [5, 6, 7, 4]])
 
@@ -59,6 +62,9 @@ def load_kitti(path: Path, times: Path | None = None, rate_hz: float = 10.0) -> 
         raise TrajectoryError(f"{path} has {len(rows)} poses but {times} has {len(stamps)} times")
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :] = values.reshape(-1, 3, 4)
+    rigid = np.isfinite(values).all(axis=1) & (np.abs(np.linalg.det(T[:, :3, :3]) - 1) < DETERMINANT_TOLERANCE)
+    if not rigid.all():
+        raise TrajectoryError(f"{path}, line {rows[int(np.argmin(rigid))][0]}: this is not a rigid motion")
     return _sorted(stamps, np.stack([se3.orthonormalise(one) for one in T]))
 
 
@@ -96,6 +102,8 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
 def _numbers(path: Path, rows: list[tuple[int, list[str]]], count: int) -> Matrix:
     out = np.empty((len(rows), count))
     for k, (number, fields) in enumerate(rows):
+        if len(fields) < count:
+            raise TrajectoryError(f"{path}, line {number}: {count} numbers were expected, not {len(fields)}")
         try:
             out[k] = [float(field) for field in fields[:count]]
         except ValueError as error:

@@ -12,6 +12,7 @@ from seamark.service.calibration import Matrix, load_euroc_sensor
 from seamark.service.evaluation import associate
 from seamark.service.sources.base import Entry, FileSource, SourceError, choose, file_source, offered
 from seamark.service.sources.images import list_images
+from seamark.service.stamps import MAX_STAMP_NS
 from seamark.service.trajectory_files import load_euroc
 from seamark.service.types import Trajectory
 
@@ -78,7 +79,7 @@ def _listed(camera: Path) -> list[tuple[int, Path]]:
         rows = [[image.stem, image.name] for image in list_images(camera / "data")]
     out = []
     for row in rows:
-        if len(row) < 2 or not row[0].isdigit():
+        if len(row) < 2 or not row[0].isdecimal() or int(row[0]) > MAX_STAMP_NS:
             raise SourceError(f"{camera}: {','.join(row)!r} is not 'nanoseconds,file'")
         out.append((int(row[0]), camera / "data" / row[1]))
     if not out:

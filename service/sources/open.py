@@ -18,6 +18,8 @@ from seamark.service.sources.tum import is_tum, open_tum
 from seamark.service.sources.video import open_video
 
 CALIBRATION = "calib.yaml"
+# Stamps are whole nanoseconds and must neither repeat nor overflow.
+MIN_FPS, MAX_FPS = 1e-3, 1e6
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ def open_sources(
     """
     if not specs:
         raise SourceError("no source was given")
-    if fps is not None and not 0 < fps < float("inf"):
-        raise SourceError(f"the number of frames per second must be positive, not {fps:g}")
+    if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
+        raise SourceError(f"the number of frames per second must be within {MIN_FPS:g} and {MAX_FPS:g}, not {fps:g}")
     rig = load_calibration(calib) if calib is not None else None
     wish = _Wish(_mode(mode), rig, fps)
     parts = _open_all(specs, wish)

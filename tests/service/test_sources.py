@@ -413,7 +413,7 @@ class TestWhatCannotBeOpened:
                 open_sources([str(spec)])
         with pytest.raises(SourceError, match="no source"):
             open_sources([])
-        with pytest.raises(SourceError, match="positive"):
+        with pytest.raises(SourceError, match="frames per second must be within"):
             open_sources([str(tmp_path / "i")], fps=0)
         with pytest.raises(SourceError, match="'fast' is not a mode"):
             open_sources([str(tmp_path / "i")], mode="fast")
