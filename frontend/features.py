@@ -39,19 +39,29 @@ def extract_features(image: NDArray[np.uint8], n_features: int, contrast: float 
     )
 
 
-def match_descriptors(a: NDArray[np.uint8], b: NDArray[np.uint8], *, ratio: float = 0.8) -> NDArray[np.int64]:
-    """Match descriptors (N, 128) and (M, 128): index pairs (K, 2) that pass the ratio test both ways and agree."""
+def match_descriptors(
+    a: NDArray[np.uint8], b: NDArray[np.uint8], *, ratio: float = 0.8, both_ways: bool = False
+) -> NDArray[np.int64]:
+    """Match descriptors (N, 128) and (M, 128): index pairs (K, 2), by ascending index of a, of mutual neighbours.
+
+    A pair must pass the ratio test (Lowe 2004) from a to b, with ``both_ways`` also from b to a. Squared distances are
+    exact, whatever the order of sums: whole numbers below 2^24 in float32.
+    """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
     af, bf = a.astype(np.float32), b.astype(np.float32)
-    squared = (af**2).sum(1)[:, None] + (bf**2).sum(1)[None] - 2 * af @ bf.T  # exact: whole numbers below 2^24
-    rows = np.arange(len(a))
-    nearest = squared.argmin(axis=1)
-    first = squared[rows, nearest]
-    second = np.partition(squared, 1, axis=1)[:, 1]
-    mutual = squared.argmin(axis=0)[nearest] == rows
-    keep = mutual & (first < ratio**2 * second)
+    squared = (af**2).sum(1)[:, None] + (bf**2).sum(1)[None] - 2 * af @ bf.T
+    rows, nearest = np.arange(len(a)), squared.argmin(axis=1)
+    keep = _distinct(squared, ratio) & (squared.argmin(axis=0)[nearest] == rows)
+    if both_ways:
+        keep &= _distinct(np.ascontiguousarray(squared.T), ratio)[nearest]
     return np.column_stack([rows[keep], nearest[keep]]).astype(np.int64)
+
+
+def _distinct(squared: NDArray[np.float32], ratio: float) -> NDArray[np.bool_]:
+    """Return of which rows (N,) the nearest column beats the second nearest by the ratio."""
+    two = np.partition(squared, 1, axis=1)[:, :2]
+    return two[:, 0] < ratio**2 * two[:, 1]
 
 
 def thumbnail_of(image: NDArray[np.uint8], longer_side_px: int) -> NDArray[np.uint8]:
