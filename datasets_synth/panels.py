@@ -1,6 +1,6 @@
 """Textured rectangles, out of which all worlds are built, and boxes made of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,9 @@ class Panel:
     """A rectangle with a picture, visible from its front only.
 
     ``corner`` (3,) is the top left corner as seen from the front; ``right`` and ``down`` (3,) are its edges in metres.
-    The BGR picture covers the whole rectangle; ``glow`` adds light of its own (lamps).
+    The BGR picture covers the whole rectangle; ``glow`` adds light of its own (lamps). What is ``sky`` shines with
+    daylight only (the sky, windows seen from inside). ``tiles`` says how often the picture is repeated, mirrored each
+    time, along right and down.
     """
 
     corner: Vector
@@ -23,6 +25,8 @@ class Panel:
     down: Vector
     image: Image
     glow: float = 0.0
+    sky: bool = False
+    tiles: tuple[float, float] = (1.0, 1.0)
 
     @property
     def normal(self) -> Vector:
@@ -58,6 +62,13 @@ def box_faces(centre: Vector, size: Vector, yaw: float = 0.0) -> list[tuple[Vect
     top = centre + 0.5 * (up * size[2] - axes[0] * size[0] + axes[1] * size[1])
     faces.append((top, axes[0] * size[0], -axes[1] * size[1]))
     return faces
+
+
+def moved(panel: Panel, yaw: float, shift: Vector) -> Panel:
+    """Return the panel turned about the z axis by ``yaw``, then moved by ``shift`` (3,); the picture is shared."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return replace(panel, corner=R @ panel.corner + shift, right=R @ panel.right, down=R @ panel.down)
 
 
 def pixels(edge: Vector, pixels_per_metre: float) -> int:

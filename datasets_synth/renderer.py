@@ -4,19 +4,25 @@ SAPIEN counts pixel centres at +0.5, so half a pixel is added to the principal p
 left and z up. Only this module and the probe import sapien, and only when a renderer is made.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth.panels import Panel
+from seamark.datasets_synth.lighting import DAY, Illumination
+from seamark.datasets_synth.panels import Panel, Vector
 from seamark.datasets_synth.world import World
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera, Rig
 
-NEAR_M, FAR_M = 0.05, 60.0
+NEAR_M = 0.05
 MIPMAP_LEVELS = 8
+METER_SCALE = 10  # the picture that exposure is metered on is so many times smaller
+NOWHERE = np.array([0.0, 0.0, -500.0])  # where movers wait that are not there
+LABEL_NOTHING, LABEL_STATIC, LABEL_SKY, LABEL_MOVER = 0, 1, 2, 10
 
 Colour = NDArray[np.float32]
 
@@ -31,6 +37,19 @@ def devices() -> str:
     return summary
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the rig sees: BGR (H, W, 3) float32 in 0..255, gamma coded, and z depth (H, W) m of the left camera.
+
+    Depth 0 is nothing. ``labels`` (H, W) uint8, if asked for: 0 nothing, 1 static, 2 sky, 10 + k mover k.
+    """
+
+    left: Colour
+    depth: NDArray[np.float32]
+    right: Colour | None = None
+    labels: NDArray[np.uint8] | None = None
+
+
 def _pose(T_world_cam: se3.Matrix) -> Any:
     """Return the SAPIEN pose of a camera whose axes are x right, y down, z forward."""
     import sapien
@@ -39,72 +58,192 @@ def _pose(T_world_cam: se3.Matrix) -> Any:
     return sapien.Pose(T_world_cam[:3, 3], [w, x, y, z])
 
 
-def _component(panel: Panel) -> Any:
-    """Return the panel as a mesh of two triangles with its picture; row 0 of a picture is v = 0."""
+def _material(panel: Panel) -> Any:
+    """Return the picture of a panel as a material."""
     import sapien.render as sr
 
     rgba = np.ascontiguousarray(cv2.cvtColor(panel.image, cv2.COLOR_BGR2RGBA))
-    material = sr.RenderMaterial()
-    material.base_color_texture = sr.RenderTexture2D(
+    texture = sr.RenderTexture2D(
         rgba, "R8G8B8A8Unorm", mipmap_levels=MIPMAP_LEVELS, filter_mode="linear", address_mode="mirror", srgb=True
     )
+    material = sr.RenderMaterial()
+    if panel.sky:
+        material.base_color = [0.0, 0.0, 0.0, 1.0]
+        material.emission_texture = texture
+    else:
+        material.base_color_texture = texture
     material.roughness, material.specular, material.metallic = 0.95, 0.05, 0.0
-    if panel.glow > 0:
-        material.emission = [panel.glow, panel.glow, panel.glow, 1.0]
-    bottom_first = panel.corners[[3, 2, 1, 0]].astype(np.float32)
+    return material
+
+
+def _mesh(panels: Sequence[Panel], material: Any) -> Any:
+    """Return panels that share a picture as one mesh; row 0 of a picture is v = 0."""
+    import sapien.render as sr
+
     picture = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
-    triangles = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-    normals = np.tile(panel.normal.astype(np.float32), (4, 1))
-    body = sr.RenderBodyComponent()
-    body.attach(sr.RenderShapeTriangleMesh(bottom_first, triangles, normals, picture, material))
-    return body
+    corners = np.concatenate([panel.corners[[3, 2, 1, 0]].astype(np.float32) for panel in panels])
+    places = np.concatenate([picture * np.array(panel.tiles, np.float32) for panel in panels])
+    normals = np.concatenate([np.tile(panel.normal.astype(np.float32), (4, 1)) for panel in panels])
+    two = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+    triangles = np.concatenate([two + np.uint32(4 * number) for number in range(len(panels))])
+    return sr.RenderShapeTriangleMesh(corners, triangles, normals, places, material)
+
+
+def _by_picture(panels: Sequence[Panel]) -> list[list[Panel]]:
+    """Return the panels in groups that share picture and light, in order of their first."""
+    groups: dict[tuple[int, float, bool], list[Panel]] = {}
+    for panel in panels:
+        groups.setdefault((id(panel.image), panel.glow, panel.sky), []).append(panel)
+    return list(groups.values())
 
 
 class Renderer:
-    """A world in front of a rig; raises ImportError or RuntimeError where sapien or a Vulkan device is missing."""
+    """A world in front of a rig; raises ImportError or RuntimeError where sapien or a Vulkan device is missing.
 
-    def __init__(self, world: World, rig: Rig) -> None:
+    ``movers`` are things of panels about their own origin; :meth:`place` moves them.
+    """
+
+    def __init__(self, world: World, rig: Rig, movers: Sequence[Sequence[Panel]] = (), *, meter: bool = False) -> None:
         import sapien
 
         sapien.set_log_level("error")
+        most = len(world.panels) + sum(len(mover) for mover in movers) + 64
         sapien.render.set_global_config(
-            max_num_materials=len(world.panels) + 64,
-            max_num_textures=len(world.panels) + 64,
-            default_mipmap_levels=MIPMAP_LEVELS,
+            max_num_materials=most, max_num_textures=most, default_mipmap_levels=MIPMAP_LEVELS
         )
+        self._world = world
         self._scene = sapien.Scene()
         self._scene.set_ambient_light(world.ambient)
-        for panel in world.panels:
-            entity = sapien.Entity()
-            entity.add_component(_component(panel))
-            self._scene.add_entity(entity)
-        for lamp in world.lamps:
-            self._scene.add_point_light(lamp.position.tolist(), list(lamp.colour), shadow=False)
+        self._glowing: list[tuple[Any, float, bool]] = []
+        self._labels = np.zeros(1, np.uint8)
+        for group in _by_picture(world.panels):
+            self._add([group], LABEL_SKY if group[0].sky and world.sun is not None else LABEL_STATIC)
+        self._movers = [self._add(_by_picture(mover), LABEL_MOVER + k) for k, mover in enumerate(movers)]
+        shown = world.lamps[: world.lamps_at_once] if world.lamps_at_once else world.lamps
+        self._lamps = [
+            self._scene.add_point_light(lamp.position.tolist(), list(lamp.colour), shadow=False) for lamp in shown
+        ]
+        self._sun = None
+        if world.sun is not None:
+            self._sun = self._scene.add_directional_light(
+                world.sun.direction.tolist(), list(world.sun.colour), shadow=False
+            )
+        self._light = DAY
         self._left = self._camera("left", rig.cam0)
         self._right = None if rig.cam1 is None else self._camera("right", rig.cam1)
+        self._meter = self._camera("meter", _smaller(rig.cam0)) if meter else None
         self._T_left_right = rig.T_cam0_cam1
+
+    def _add(self, groups: Sequence[Sequence[Panel]], label: int) -> Any:
+        import sapien
+
+        entity, body = sapien.Entity(), sapien.render.RenderBodyComponent()
+        for group in groups:
+            material = _material(group[0])
+            if group[0].glow > 0 or group[0].sky:
+                self._glowing.append((material, group[0].glow, group[0].sky))
+                self._glow(material, group[0].glow, group[0].sky, DAY)
+            body.attach(_mesh(group, material))
+        entity.add_component(body)
+        self._scene.add_entity(entity)
+        if entity.per_scene_id >= len(self._labels):
+            self._labels = np.pad(self._labels, (0, entity.per_scene_id + 1 - len(self._labels)))
+        self._labels[entity.per_scene_id] = label
+        return entity
 
     def _camera(self, name: str, camera: Camera) -> Any:
         field_of_view = 2 * np.arctan(camera.height / 2 / camera.fy)
-        made = self._scene.add_camera(name, camera.width, camera.height, field_of_view, NEAR_M, FAR_M)
-        made.set_perspective_parameters(NEAR_M, FAR_M, camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, 0.0)
+        far = self._world.far_m
+        made = self._scene.add_camera(name, camera.width, camera.height, field_of_view, NEAR_M, far)
+        made.set_perspective_parameters(NEAR_M, far, camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, 0.0)
         return made
 
-    def render(self, T_world_cam: se3.Matrix) -> tuple[Colour, NDArray[np.float32], Colour | None]:
-        """Return BGR (H, W, 3) float32 in 0..255, depth (H, W) float32 m (0: nothing), and the right BGR or None."""
-        self._left.entity.set_pose(_pose(T_world_cam))
+    @staticmethod
+    def _glow(material: Any, glow: float, sky: bool, light: Illumination) -> None:
+        factors = light.sky if sky else [min(1.0, 1.2 * max(light.lamps))] * 3
+        material.emission = [*(glow * factor for factor in factors), 1.0]
+
+    def illuminate(self, light: Illumination) -> None:
+        """Change the light from now on."""
+        if light == self._light:
+            return
+        self._light = light
+        world = self._world
+        self._scene.set_ambient_light([a * b for a, b in zip(world.ambient, light.ambient, strict=True)])
+        if self._sun is not None and world.sun is not None:
+            self._sun.color = [a * b for a, b in zip(world.sun.colour, light.sun, strict=True)]
+        if not world.lamps_at_once:
+            for shown, lamp in zip(self._lamps, world.lamps, strict=True):
+                shown.color = [a * b for a, b in zip(lamp.colour, light.lamps, strict=True)]
+        for material, glow, sky in self._glowing:
+            self._glow(material, glow, sky, light)
+
+    def place(self, mover: int, position: Vector | None, yaw: float = 0.0) -> None:
+        """Put a mover's origin to ``position`` (3,) m, turned about z; None takes it out of the world."""
+        import sapien
+
+        where = NOWHERE if position is None else position
+        self._movers[mover].set_pose(sapien.Pose(where, [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+
+    def _choose_lamps(self, eye: Vector) -> None:
+        """Light the nearest lamps; the last of them fades out before another takes its place."""
+        lamps = self._world.lamps
+        distances = np.array([np.linalg.norm(lamp.position - eye) for lamp in lamps])
+        order = np.argsort(distances, kind="stable")
+        count = len(self._lamps)
+        edge = distances[order[count]] if len(lamps) > count else np.inf
+        for shown, number in zip(self._lamps, order[:count], strict=True):
+            fade = min(1.0, (edge - distances[number]) / (0.3 * edge)) if np.isfinite(edge) else 1.0
+            shown.entity.set_pose(_at(lamps[number].position))
+            factors = zip(lamps[number].colour, self._light.lamps, strict=True)
+            shown.color = [fade * colour * factor for colour, factor in factors]
+
+    def meter(self, T_world_cam: se3.Matrix) -> Colour:
+        """Return a small picture at an exposure of one, to choose an exposure by; only where ``meter`` was asked."""
+        assert self._meter is not None
+        self._update(T_world_cam, [self._meter])
+        self._meter.take_picture()
+        return self._colour(self._meter)
+
+    def _update(self, T_world_cam: se3.Matrix, cameras: Sequence[Any]) -> None:
+        if self._world.lamps_at_once:
+            self._choose_lamps(T_world_cam[:3, 3])
+        for camera in cameras:
+            camera.entity.set_pose(_pose(T_world_cam))
+        self._scene.update_render()
+
+    def render(self, T_world_cam: se3.Matrix, *, exposure: float | None = None, labels: bool = False) -> View:
+        """Return what the rig sees from ``T_world_cam``; ``exposure`` is a factor on all light, None for one."""
         if self._right is not None and self._T_left_right is not None:
             self._right.entity.set_pose(_pose(T_world_cam @ self._T_left_right))
-        self._scene.update_render()
+        if exposure is not None:
+            for camera in (self._left, self._right):
+                if camera is not None:
+                    camera.set_property("exposure", float(exposure))
+        self._update(T_world_cam, [self._left])
         self._left.take_picture()
         depth = np.maximum(-self._left.get_picture("Position")[..., 2], 0)
         left = self._colour(self._left)
+        marked = self._labels[self._left.get_picture("Segmentation")[..., 1]] if labels else None
         if self._right is None:
-            return left, depth, None
+            return View(left, depth, None, marked)
         self._right.take_picture()
-        return left, depth, self._colour(self._right)
+        return View(left, depth, self._colour(self._right), marked)
 
     @staticmethod
     def _colour(camera: Any) -> Colour:
         colour: Colour = np.asarray(camera.get_picture("Color")[..., 2::-1] * np.float32(255), np.float32)
         return colour
+
+
+def _at(position: Vector) -> Any:
+    import sapien
+
+    return sapien.Pose(position)
+
+
+def _smaller(camera: Camera) -> Camera:
+    """Return a camera with the same view in fewer pixels."""
+    s = METER_SCALE
+    width, height = camera.width // s, camera.height // s
+    return Camera(width, height, camera.fx / s, camera.fy / s, (width - 1) / 2, (height - 1) / 2)

@@ -50,17 +50,22 @@ MODELS = {"mild": SensorModel(2.0, 0.001, 0.0), "cheap": SensorModel(5.0, 0.003,
 
 @dataclass(frozen=True)
 class CodedFrame:
-    """One frame as files: JPEG pictures and a PNG depth image, empty where the sensor is missing."""
+    """One frame as files: JPEG pictures, PNG depth and PNG labels (see renderer.View), empty where they are missing."""
 
     index: int
     left: bytes
     right: bytes = b""
     depth: bytes = b""
+    labels: bytes = b""
 
 
-def expose(colour: NDArray[np.float32], model: SensorModel, rng: np.random.Generator) -> Image:
-    """Return what the sensor reads of BGR light (H, W, 3) in 0..255: uint8 with noise."""
-    return to_image(colour + np.float32(model.image_noise_grey) * rng.standard_normal(colour.shape, np.float32))
+def expose(colour: NDArray[np.float32], model: SensorModel, rng: np.random.Generator, gain: float = 1.0) -> Image:
+    """Return what the sensor reads of BGR light (H, W, 3) in 0..255: uint8 with noise.
+
+    Noise is that of photons: at the same brightness of the picture it grows with the square root of the gain.
+    """
+    deviation = np.float32(model.image_noise_grey * float(np.sqrt(gain)))
+    return to_image(colour + deviation * rng.standard_normal(colour.shape, np.float32))
 
 
 def measure_depth(
@@ -91,6 +96,11 @@ def code_depth(raw: NDArray[np.uint16]) -> bytes:
     """Return raw depth as 16 bit PNG, coded fast rather than small."""
     fast = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     return bytes(cv2.imencode(".png", raw, fast)[1])
+
+
+def code_labels(labels: NDArray[np.uint8]) -> bytes:
+    """Return labels as 8 bit PNG."""
+    return bytes(cv2.imencode(".png", labels, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1])
 
 
 def decode(coded: CodedFrame, stamp_ns: int, file: str) -> Frame:

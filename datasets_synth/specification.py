@@ -12,17 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark import SeamarkError
-from seamark.datasets_synth import sensor, world_loop
+from seamark.datasets_synth import lighting, optics, sensor, trajectories, world_loop
+from seamark.datasets_synth.route import Route
 from seamark.datasets_synth.world import World
+from seamark.datasets_synth.worlds import WORLDS
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera, Rig
 from seamark.frontend.types import Mode
 
-WORLDS = ("loop",)
-SIZES = tuple(world_loop.PLANS)
+SIZES = ("full", "small")
+# Modules that rendered files do not depend on; all others are part of the content hash.
+CHANGE_NO_PICTURE = frozenset(
+    {"__init__", "toy", "imagery", "fallback", "scenario", "scenarios", "sequence", "rendering", "layouts"}
+    | {"motion_sensors", "ground_truth"}
+)
+LAP = "lap"  # the trajectory that the world loop has always had, and no other world
+TRAJECTORIES = (LAP, *trajectories.KINDS)
 IMAGES = {"640x480": (640, 480), "320x240": (320, 240)}
 SENSORS = (Mode.RGBD, Mode.STEREO, Mode.MONO)
 FRAMES = (2, 5000)
+MOST_MOVERS = 3
+OFFSET_CM = (-100, 100)
+RUNS = 99
 FPS = 15.0
 FOCAL_PER_WIDTH = 0.640625  # 410 px at a width of 640: 76 degrees wide
 BASELINE_M = 0.12
@@ -30,7 +41,12 @@ BASELINE_M = 0.12
 
 @dataclass(frozen=True)
 class Specification:
-    """One synthetic sequence, complete: the same specification gives the same bits on one machine."""
+    """One synthetic sequence, complete: the same specification gives the same bits on one machine.
+
+    ``seed`` draws the world; ``run`` above 0 draws another motion, other people and other noise in the same world.
+    ``offset`` shifts the camera to its left by so many cm along the whole trajectory. ``movers`` people walk about.
+    ``labels`` 1 adds labels to what a worker sends (renderer.View); it changes nothing else.
+    """
 
     world: str
     frames: int = 600
@@ -39,6 +55,23 @@ class Specification:
     size: str = "full"
     image: str = "640x480"
     sensor: str = "mild"
+    trajectory: str = LAP
+    condition: str = "day"
+    camera: str = "ideal"
+    movers: int = 0
+    offset: int = 0
+    run: int = 0
+    labels: int = 0
+
+    @property
+    def motion_seed(self) -> int:
+        """Return the seed of all that differs from run to run: motion, people, noise."""
+        return self.seed + 1_000_003 * self.run
+
+    @property
+    def route(self) -> Route:
+        """Return the way through the world."""
+        return WORLDS[self.world].route(self.size)
 
     @property
     def mode(self) -> Mode:
@@ -50,18 +83,25 @@ class Specification:
         """Return the calibration of the sensors."""
         width, height = IMAGES[self.image]
         focal = FOCAL_PER_WIDTH * width
-        camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        distortion = optics.MODELS[self.camera].distortion
+        camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, distortion)
         if self.mode is Mode.STEREO:
             return Rig(camera, camera, se3.make(np.eye(3), np.array([BASELINE_M, 0, 0])))
         return Rig(camera, depth_factor=sensor.DEPTH_FACTOR)
 
     def build(self) -> World:
         """Return the world."""
-        return world_loop.build_loop(world_loop.PLANS[self.size], self.seed)
+        return WORLDS[self.world].build(self.size, self.seed)
 
     def poses(self) -> NDArray[np.float64]:
-        """Return T_world_cam (N, 4, 4)."""
-        return world_loop.loop_poses(world_loop.PLANS[self.size], self.frames, self.seed)
+        """Return T_world_cam (N, 4, 4); raises SeamarkError where the world's route does not allow the trajectory."""
+        if self.trajectory == LAP:
+            poses = world_loop.loop_poses(world_loop.PLANS[self.size], self.frames, self.motion_seed)
+        else:
+            poses = trajectories.make_trajectory(self.trajectory, self.route, self.frames, FPS, self.motion_seed)
+        if self.offset:
+            poses = poses @ se3.make(np.eye(3), np.array([-self.offset / 100, 0, 0]))
+        return poses
 
 
 def _choice(options: tuple[str, ...]) -> Callable[[str, str], str]:
@@ -75,7 +115,7 @@ def _choice(options: tuple[str, ...]) -> Callable[[str, str], str]:
 
 def _number(low: int, high: int) -> Callable[[str, str], int]:
     def parse(key: str, text: str) -> int:
-        if not text.isdecimal() or not low <= int(text) <= high:
+        if not text.removeprefix("-").isdecimal() or not low <= int(text) <= high:
             raise SeamarkError(f"{key} of a synthetic sequence is a whole number from {low} to {high}, not {text!r}")
         return int(text)
 
@@ -89,6 +129,13 @@ PARSERS: dict[str, Callable[[str, str], str | int]] = {
     "size": _choice(SIZES),
     "image": _choice(tuple(IMAGES)),
     "sensor": _choice(tuple(sensor.MODELS)),
+    "trajectory": _choice(TRAJECTORIES),
+    "condition": _choice(lighting.CONDITIONS),
+    "camera": _choice(tuple(optics.MODELS)),
+    "movers": _number(0, MOST_MOVERS),
+    "offset": _number(*OFFSET_CM),
+    "run": _number(0, RUNS),
+    "labels": _number(0, 1),
 }
 
 
@@ -105,7 +152,14 @@ def parse(text: str) -> Specification:
         if key in values:
             raise SeamarkError(f"setting {key} of synthetic world {world} is given twice")
         values[key] = PARSERS[key](key, value)
-    return Specification(world, **values)  # type: ignore[arg-type]
+    kind = WORLDS[world]
+    values = {"frames": kind.frames, "trajectory": kind.trajectory, **values}
+    specification = Specification(world, **values)  # type: ignore[arg-type]
+    if specification.size not in kind.sizes:
+        raise SeamarkError(f"synthetic world {world} has no size={specification.size}, only {', '.join(kind.sizes)}")
+    if specification.trajectory == LAP and kind.trajectory != LAP:
+        raise SeamarkError(f"trajectory=lap belongs to the world loop; in {world} it is called {kind.trajectory}")
+    return specification
 
 
 def content_hash(specification: Specification) -> str:
@@ -116,9 +170,7 @@ def content_hash(specification: Specification) -> str:
         simulator = "none"
     digest = hashlib.sha256(json.dumps(asdict(specification), sort_keys=True).encode())
     digest.update(f"sapien {simulator} numpy {np.__version__} cv2 {cv2.__version__}".encode())
-    for name in (
-        *("textures", "prints", "panels", "trajectory", "world", "floor_plan", "world_loop"),
-        *("renderer", "sensor", "specification", "worker", "folder"),
-    ):
-        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        if file.stem not in CHANGE_NO_PICTURE:
+            digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

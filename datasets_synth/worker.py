@@ -14,7 +14,7 @@ import sys
 import threading
 from typing import Any, BinaryIO
 
-HEADER = struct.Struct("<iIII")  # index, bytes of the left picture, the right picture, the depth image
+HEADER = struct.Struct("<iIIII")  # index, bytes of the left picture, the right picture, the depth image, the labels
 
 
 def _die_with_parent() -> None:
@@ -42,29 +42,18 @@ def _private_output() -> BinaryIO:
 
 def _render(job: dict[str, Any], output: BinaryIO) -> None:
     import cv2
-    import numpy as np
 
-    from seamark.datasets_synth import sensor
-    from seamark.datasets_synth.renderer import Renderer
     from seamark.datasets_synth.specification import Specification
-    from seamark.frontend.types import Mode
+    from seamark.datasets_synth.studio import Studio
 
     cv2.setNumThreads(1)
     specification = Specification(**job["specification"])
-    poses = specification.poses()
-    model, camera = sensor.MODELS[specification.sensor], specification.rig.cam0
-    distortion = model.distortion_field(camera.height, camera.width, specification.seed)
-    renderer = Renderer(specification.build(), specification.rig)
+    studio = Studio(specification)
     for index in range(job["first"], specification.frames, job["step"]):
-        colour, depth, right_colour = renderer.render(poses[index])
-        rng = np.random.default_rng([specification.seed, index, 0x5E])
-        left = sensor.code_picture(sensor.expose(colour, model, rng))
-        right = b"" if right_colour is None else sensor.code_picture(sensor.expose(right_colour, model, rng))
-        raw = b""
-        if specification.mode is Mode.RGBD:
-            raw = sensor.code_depth(sensor.measure_depth(depth, distortion, model, rng))
-        output.write(HEADER.pack(index, len(left), len(right), len(raw)))
-        for blob in (left, right, raw):
+        coded = studio.frame(index)
+        blobs = (coded.left, coded.right, coded.depth, coded.labels)
+        output.write(HEADER.pack(index, *(len(blob) for blob in blobs)))
+        for blob in blobs:
             output.write(blob)
         output.flush()
 

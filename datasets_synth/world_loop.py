@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.datasets_synth import floor_plan
 from seamark.datasets_synth.floor_plan import Space
-from seamark.datasets_synth.trajectory import look
+from seamark.datasets_synth.route import Route
+from seamark.datasets_synth.walk import STEP_M, rounded, walk
 from seamark.datasets_synth.world import World
 
 EYE_HEIGHT_M = 1.3
-STEP_M = 0.01  # of the path before it is resampled
 
 
 @dataclass(frozen=True)
@@ -84,38 +83,24 @@ def spaces(plan: LoopPlan) -> list[Space]:
 def lap(plan: LoopPlan) -> NDArray[np.float64]:
     """Return one closed lap (N, 2) in steps of at most STEP_M, anticlockwise, corners rounded."""
     x, y = plan.half_x, plan.half_y
-    corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]])
-    distances = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    s = np.arange(0, distances[-1], STEP_M)
-    path = np.stack([np.interp(s, distances, corners[:, axis]) for axis in range(2)], axis=1)
-    reach = int(5 * plan.rounding_m / STEP_M)
-    padded = np.concatenate([path[-reach:], path, path[:reach]])
-    kernel = cv2.getGaussianKernel(2 * reach + 1, plan.rounding_m / STEP_M).ravel()
-    return np.stack([np.convolve(padded[:, axis], kernel, "valid") for axis in range(2)], axis=1)
+    return rounded(np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]]), plan.rounding_m)
 
 
 def loop_poses(plan: LoopPlan, n_frames: int, seed: int) -> NDArray[np.float64]:
     """Return T_world_cam (N, 4, 4): a lap and ``overlap_m`` more, slow in turns, with the sway of a walking robot."""
-    rng = np.random.default_rng([seed, 0x9A7])
     once = lap(plan)
     first, more = (int(length / STEP_M) for length in (plan.start_m, plan.overlap_m))
     path = np.roll(once, -first, axis=0)
     path = np.concatenate([path, path[: more + 1]])
-    steps = np.diff(path, axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
-    effort = np.concatenate([[0], np.cumsum(lengths[1:] + plan.turn_cost_m * np.abs(np.diff(headings)))])
-    at = np.interp(np.linspace(0, effort[-1], n_frames), effort, np.arange(len(effort), dtype=np.float64))
-    place = np.stack([np.interp(at, np.arange(len(path)), path[:, axis]) for axis in range(2)], axis=1)
-    heading = np.interp(at, np.arange(len(headings)), headings)
-    travelled = np.interp(at, np.arange(len(path)), np.concatenate([[0], np.cumsum(lengths)]))
-    phases = rng.uniform(0, 2 * np.pi, 6)
-    waves = np.sin(2 * np.pi * travelled[:, None] / np.array([7.3, 5.9, 4.7, 6.7, 8.9, 3.7]) + phases)
-    amplitudes = np.array([0.09, 0.02, np.deg2rad(2.5), np.deg2rad(1.5), np.deg2rad(1.0), 0.01])
-    side, lift, yaw, pitch, roll, bob = (waves * amplitudes).T
-    aside = np.stack([-np.sin(heading), np.cos(heading)], axis=1) * side[:, None]
-    position = np.column_stack([place + aside, EYE_HEIGHT_M + lift + bob])
-    return np.stack([look(*sample) for sample in zip(position, heading + yaw, pitch, roll, strict=True)])
+    return walk(path, n_frames, seed, EYE_HEIGHT_M, plan.turn_cost_m)
+
+
+def loop_route(plan: LoopPlan) -> Route:
+    """Return the ring of corridors as a route."""
+    x, y = plan.half_x, plan.half_y
+    corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
+    waypoints = np.column_stack([corners, np.full(4, EYE_HEIGHT_M)])
+    return Route("lap", waypoints, True, plan.rounding_m, 1.6, floor_plan.CLEARANCE_M)
 
 
 def build_loop(plan: LoopPlan, seed: int) -> World:

@@ -28,7 +28,7 @@ for index in range(job["first"], job["specification"]["frames"], job["step"]):
         sys.exit("the driver fell over")
     left = code_picture(np.full((240, 320, 3), index % 256, np.uint8))
     depth = code_depth(np.full((240, 320), 1000 + index, np.uint16))
-    sys.stdout.buffer.write(HEADER.pack(index, len(left), 0, len(depth)) + left + depth)
+    sys.stdout.buffer.write(HEADER.pack(index, len(left), 0, len(depth), 0) + left + depth)
 """
 SPEC = "loop,size=small,image=320x240,frames={}"
 
