@@ -3,13 +3,16 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import MapSnapshot
 from seamark.frontend.types import Frame, Mode, Odometry
 from seamark.service import topics
+from seamark.service.bus import DRAIN_TIMEOUT_S
 from seamark.service.config import SeamarkConfig
 from seamark.service.frame_window import FrameWindow, Nodes, ask
 from seamark.service.launcher import Launcher
@@ -24,7 +27,7 @@ from seamark.service.types import KeyframeSummary, ProcessUsage, RunRecord
 
 MAP_FILE = "map.seamark"
 RECORDING_FILE = "run.rrd"
-DRAIN_TIMEOUT_S = 600.0
+NO_TRACKS = np.zeros((0, 4), np.float32)
 
 Progress = Callable[[int, int | None, Odometry], None]
 
@@ -142,8 +145,9 @@ def _send_all(
 
     def take(pairs: Iterator[tuple[Frame | Unreadable, Odometry]]) -> None:
         for frame, odometry in pairs:
-            answered.append(odometry)
             recorder.frame(frame, odometry)
+            # The tracks were for the recording: of a day's frames they would fill the memory.
+            answered.append(replace(odometry, tracks=NO_TRACKS))
             if progress is not None:
                 progress(len(answered), source.n_frames, odometry)
 

@@ -10,6 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from seamark.service.config import load_config
+from seamark.service.run import RunOptions, run
+from seamark.service.sources.open import open_sources
+
 REAL_DATA = Path(__file__).parents[2].parent / "shared" / "data"
 QUICK = ["-o", "frontend.max_corners=250", "-o", "frontend.sift_features=400"]
 COMMAND = [sys.executable, "-c", "from seamark.service.cli import main; main()"]
@@ -125,3 +129,17 @@ def test_real_rgbd_sequence(tmp_path: Path) -> None:
     report = json.loads(seamark("run", short, "--out", out, "--json").stdout)
     assert report["frames"]["tracked"] == 120
     assert 0.005 < report["accuracy"]["corrected"]["ate"]["translation_m"]["rmse"] < 0.08
+
+
+def test_a_record_does_not_hold_what_was_for_the_recording_only(toy_kitti: Path, tmp_path: Path) -> None:
+    """Expected: tracks pass by with every frame, and none are left at the end, however long the run."""
+    seen = []
+    record = run(
+        open_sources([str(toy_kitti)], mode="mono"),
+        RunOptions(tmp_path / "out", (str(toy_kitti),), in_process=True),
+        load_config(overrides=["service.record=false", "frontend.sift_features=200"]),
+        lambda done, total, odometry: seen.append(len(odometry.tracks)),
+    )
+    assert len(record.odometry) == len(seen) == 40
+    assert max(seen) > 50
+    assert sum(len(odometry.tracks) for odometry in record.odometry) == 0
