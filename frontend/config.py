@@ -20,40 +20,40 @@ class FrontendConfig(BaseModel):
 
     # Motion
     pnp_threshold_px: float = Field(2.5, gt=0, description="reprojection error of a RANSAC inlier")
-    pnp_iterations: int = Field(150, ge=10, le=10000)
+    pnp_iterations: int = Field(150, ge=10, le=10000, description="RANSAC samples at most; recovery takes four times")
     pixel_sigma: float = Field(0.7, gt=0, description="standard deviation of a tracked corner in pixels")
     min_inliers: int = Field(15, ge=6, description="fewer inliers than this mean that the pose is not known")
     good_inliers: int = Field(40, ge=6, description="from this many inliers on the pose is GOOD, below MARGINAL")
 
     # Depth
-    depth_min_m: float = Field(0.2, gt=0)
+    depth_min_m: float = Field(0.2, gt=0, description="readings and stereo matches nearer are ignored")
     depth_max_m: float = Field(10.0, gt=0, description="RGB-D readings beyond are ignored")
-    depth_sigma_floor_m: float = Field(0.003, gt=0)
+    depth_sigma_floor_m: float = Field(0.003, gt=0, description="sigma of an RGB-D reading at no distance")
     depth_sigma_per_m2: float = Field(0.0035, gt=0, description="sigma of a reading at z metres is floor + this * z^2")
-    disparity_sigma_px: float = Field(0.4, gt=0)
-    min_disparity_px: float = Field(0.5, gt=0)
+    disparity_sigma_px: float = Field(0.4, gt=0, description="standard deviation of a stereo match")
+    min_disparity_px: float = Field(0.5, gt=0, description="stereo matches with less are taken as unknown")
 
     # Keyframes and the local window
     keyframe_max_gap_s: float = Field(2.0, gt=0, description="a keyframe at least this often while the camera moves")
     keyframe_parallax_px: float = Field(
         35.0, gt=0, description="median parallax, rotation taken out, of a new keyframe"
     )
-    keyframe_rotation_deg: float = Field(15.0, gt=0)
+    keyframe_rotation_deg: float = Field(15.0, gt=0, description="rotation of a new keyframe against the last")
     keyframe_tracked_ratio: float = Field(0.6, gt=0, lt=1, description="share of the keyframe's landmarks still seen")
-    window_keyframes: int = Field(8, ge=3, le=30)
-    window_iterations: int = Field(6, ge=1, le=50)
+    window_keyframes: int = Field(8, ge=3, le=30, description="keyframes adjusted together")
+    window_iterations: int = Field(6, ge=1, le=50, description="Levenberg-Marquardt steps at most")
 
     # Mono initialisation
     initial_parallax_px: float = Field(18.0, gt=0, description="median parallax before two views are tried")
-    initial_min_landmarks: int = Field(50, ge=10)
-    triangulation_min_angle_deg: float = Field(0.9, gt=0)
+    initial_min_landmarks: int = Field(50, ge=10, description="landmarks of a first map at least")
+    triangulation_min_angle_deg: float = Field(0.9, gt=0, description="angle between the rays to a new landmark")
 
     # Loss and recovery
     patience_s: float = Field(0.6, gt=0, description="sensor time without a pose after which a new session starts")
     recovery_keyframes: int = Field(3, ge=1, le=20, description="recent keyframes tried by descriptors when flow fails")
 
     # What a keyframe carries
-    sift_features: int = Field(1000, ge=100, le=10000)
-    sift_contrast: float = Field(0.015, gt=0, lt=1)
-    jpeg_quality: int = Field(85, ge=30, le=100)
+    sift_features: int = Field(1000, ge=100, le=10000, description="strongest key points kept")
+    sift_contrast: float = Field(0.015, gt=0, lt=1, description="contrast threshold of SIFT (Lowe 2004)")
+    jpeg_quality: int = Field(85, ge=30, le=100, description="of the image that the map keeps")
     thumbnail_px: int = Field(96, ge=16, le=640, description="longer side of the copy for colour histograms")

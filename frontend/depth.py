@@ -23,7 +23,10 @@ EDGE_SPREAD = 0.05  # relative depth range in a 3x3 neighbourhood that marks a d
 
 
 class DepthSensor(Protocol):
-    """Gives inverse depths of pixels of ``Frame.image``."""
+    """Gives inverse depths of pixels of ``Frame.image``.
+
+    A sensor keeps nothing between calls: the tracker and the keyframe thread ask the same one at the same time.
+    """
 
     def inverse_depth(
         self, frame: Frame, points: NDArray[np.floating]
