@@ -60,7 +60,7 @@ def _calibration(rig: Rig, mode: Mode) -> str:
     camera = rig.cam0
     lines = ["model: pinhole", f"width: {camera.width}", f"height: {camera.height}"]
     lines += [f"{key}: {getattr(camera, key)!r}" for key in ("fx", "fy", "cx", "cy")]
-    lines.append("distortion: []")
+    lines.append(f"distortion: {list(camera.distortion)!r}")
     if mode is Mode.RGBD:
         lines.append(f"depth_factor: {rig.depth_factor!r}")
     if rig.T_cam0_cam1 is not None:

@@ -124,19 +124,23 @@ class _Worker:
 
 
 class RenderPool:
-    """One or two worker processes that render a specification; a context manager that ends them on leaving."""
+    """One or two worker processes that render a specification; a context manager that ends them on leaving.
 
-    def __init__(self, specification: Specification) -> None:
+    Frames before ``begin`` are left out.
+    """
+
+    def __init__(self, specification: Specification, begin: int = 0) -> None:
         self._specification = specification
+        self._begin = begin
         self._workers: list[_Worker] = []
 
     def __enter__(self) -> Self:
         """Start the workers."""
-        few = self._specification.frames < FRAMES_FOR_TWO_WORKERS or (os.cpu_count() or 1) < 2
+        few = self._specification.frames - self._begin < FRAMES_FOR_TWO_WORKERS or (os.cpu_count() or 1) < 2
         count = 1 if few else 2
         try:
             for first in range(count):
-                self._workers.append(_Worker(self._specification, first, count))
+                self._workers.append(_Worker(self._specification, self._begin + first, count))
         except BaseException:
             self.close()
             raise
@@ -153,8 +157,8 @@ class RenderPool:
 
     def frames(self) -> Iterator[CodedFrame]:
         """Yield all frames in order; raises SeamarkError where a worker dies."""
-        for index in range(self._specification.frames):
-            yield self._workers[index % len(self._workers)].next_frame(index)
+        for index in range(self._begin, self._specification.frames):
+            yield self._workers[(index - self._begin) % len(self._workers)].next_frame(index)
 
     def close(self) -> None:
         """End all workers."""

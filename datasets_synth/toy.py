@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from seamark import SeamarkError
 from seamark.datasets_synth import prints, textures, trajectory
 from seamark.datasets_synth.panels import Panel, Vector, box_faces, pixels
+from seamark.datasets_synth.route import Route
 from seamark.datasets_synth.sequence import GroundTruth, SynthSequence
 from seamark.datasets_synth.textures import Image
 from seamark.frontend import se3
@@ -30,6 +31,13 @@ LEVELS = 4
 PADDING_PX = 8  # a multiple of 2 ** (LEVELS - 1), so that panels stay on whole pixels in all levels
 
 Trajectory = Literal["loop", "line", "turn"]
+
+
+def route() -> Route:
+    """Return the way round the pillar, for ``trajectories.make_trajectory``: eight corners near the lap ``loop``."""
+    angles = np.arange(8) * np.pi / 4
+    ring = np.column_stack([LAP_RADIUS_M * np.cos(angles), LAP_RADIUS_M * np.sin(angles), np.full(8, EYE_HEIGHT_M)])
+    return Route("toy", ring, True, 0.8, 0.9, 0.3)
 
 
 def _room(rng: np.random.Generator) -> list[Panel]:
@@ -242,8 +250,9 @@ def toy_sequence(
     fps: float = 15.0,
     *,
     world: ToyWorld | None = None,
+    poses: NDArray[np.float64] | None = None,
 ) -> SynthSequence:
-    """Return a run through the toy world of ``seed`` (or through ``world``).
+    """Return a run through the toy world of ``seed`` (or through ``world``), along ``poses`` (N, 4, 4) where given.
 
     ``loop`` is 1.08 laps on a circle of 2.4 m (16.3 m), ``line`` at most 4 m of 4 cm steps looking 25 degrees aside,
     ``turn`` at most 2 rad of 2 degree steps on the spot. Raises SeamarkError for another trajectory or
@@ -252,7 +261,9 @@ def toy_sequence(
     if n_frames < 1:
         raise SeamarkError(f"a toy sequence needs at least one frame, not {n_frames}")
     world = ToyWorld(seed) if world is None else world
-    if trajectory_name == "loop":
+    if poses is not None:
+        n_frames = len(poses)
+    elif trajectory_name == "loop":
         poses = trajectory.circle(n_frames, LAP_RADIUS_M, EYE_HEIGHT_M, LAPS)
     elif trajectory_name == "line":
         start = np.array([-3.0, -2.2, EYE_HEIGHT_M])
@@ -266,6 +277,6 @@ def toy_sequence(
 
     def frames() -> Iterator[Frame]:
         for index in range(n_frames):
-            yield world.render(poses[index], index, int(truth.stamps_ns[index]), sensors)
+            yield world.render(truth.T_world_cam[index], index, int(truth.stamps_ns[index]), sensors)
 
     return SynthSequence(f"toy-{trajectory_name}", world.rig(sensors), sensors, n_frames, truth, frames)
