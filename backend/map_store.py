@@ -1,5 +1,7 @@
 """The map on disk: one SQLite file that survives ``kill -9`` at any moment."""
 
+import fcntl
+import logging
 import os
 import sqlite3
 import threading
@@ -26,6 +28,8 @@ from seamark.backend.map_codec import (
 )
 from seamark.backend.types import Loop, MapSnapshot
 from seamark.frontend.types import Keyframe
+
+logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x5EA3A12C
 SCHEMA_VERSION = 1
@@ -68,9 +72,12 @@ class MapStore:
                 f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, check_same_thread=False
             )
             self._database.row_factory = sqlite3.Row
+        self._claim: int | None = None
         try:
             with self._translated("opened"):
                 self._open()
+            if not read_only:
+                self._claim = _claim(path)
         except BaseException:
             self._database.close()
             raise
@@ -165,6 +172,9 @@ class MapStore:
                 raise
         finally:
             self._database.close()
+            if self._claim is not None:  # after the database: closing any descriptor of a file drops SQLite's own locks
+                os.close(self._claim)
+                self._claim = None
 
     def _open(self) -> None:
         """Create the tables, or check that they are ours."""
@@ -215,6 +225,22 @@ class MapStore:
 def _insert(table: str, columns: tuple[str, ...]) -> str:
     marks = ", ".join("?" * len(columns))
     return f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}) VALUES ({marks})"
+
+
+def _claim(path: Path) -> int:
+    """Return a descriptor that keeps other writers from the map until it is closed, by whatever end of the process.
+
+    Two services would number their keyframes alike and overwrite one another's.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise MapError(f"the map {path} is in use by another process") from error
+    except OSError:  # a file system without locks
+        logger.warning("the map %s cannot be locked: keep other services from it", path)
+    return descriptor
 
 
 def _sync_folder(folder: Path) -> None:

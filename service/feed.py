@@ -8,7 +8,7 @@ from seamark.service import topics
 from seamark.service.run import Pace, Progress
 from seamark.service.sources.base import Source, Unreadable
 from seamark.service.zenoh_bus import ZenohBus
-from seamark.service.zenoh_session import open_session
+from seamark.service.zenoh_session import CLIENT_CONNECT_TIMEOUT_S, open_session
 
 
 def feed(
@@ -24,7 +24,7 @@ def feed(
         if progress is not None:
             progress(outcomes.total(), source.n_frames, odometry)
 
-    with open_session("client", connect=[endpoint]) as session:
+    with open_session("client", connect=[endpoint], timeout_s=CLIENT_CONNECT_TIMEOUT_S) as session:
         bus = ZenohBus(session, topics.RUNNER, namespace)
         pace = Pace() if realtime else None
         try:

@@ -23,7 +23,7 @@ from seamark.service.requests import Empty, Status
 from seamark.service.topics import BACKEND, FRONTEND, KEYFRAME, NODES, PROGRESS, RUNNER, VOCAB
 from seamark.service.types import ProcessUsage
 from seamark.service.zenoh_bus import ZenohBus
-from seamark.service.zenoh_session import Watch, free_endpoint, open_session
+from seamark.service.zenoh_session import SessionError, Watch, free_endpoint, open_session, who_lives
 
 logger = logging.getLogger(__name__)
 
@@ -164,6 +164,10 @@ class Launcher:
             self._session = open_session("router", listen=[self.endpoint])
         else:
             self._session = open_session("client", connect=[self.endpoint])
+            if who_lives(self._session, self._settings.namespace):
+                raise SessionError(
+                    f"another service is alive at {self.endpoint} in namespace {self._settings.namespace!r}"
+                )
         self._watch = Watch(self._session, self._settings.namespace)
         self._bus = ZenohBus(self._session, RUNNER, self._settings.namespace)
         for name in (BACKEND, VOCAB):  # readers first

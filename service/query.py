@@ -12,7 +12,7 @@ from seamark.service.requests import PlaceQuery, PlaceReply
 from seamark.service.results import pose_fields
 from seamark.service.stamps import format_stamp
 from seamark.service.zenoh_bus import ZenohBus
-from seamark.service.zenoh_session import open_session
+from seamark.service.zenoh_session import CLIENT_CONNECT_TIMEOUT_S, open_session
 
 
 class QueryError(SeamarkError):
@@ -25,7 +25,7 @@ def ask(image: Path, *, endpoint: str, namespace: str, top_k: int, timeout_s: fl
         content = image.read_bytes()
     except OSError as error:
         raise QueryError(f"{image} cannot be read: {error.strerror}") from error
-    with open_session("client", connect=[endpoint], timeout_s=timeout_s) as session:
+    with open_session("client", connect=[endpoint], timeout_s=min(timeout_s, CLIENT_CONNECT_TIMEOUT_S)) as session:
         bus = ZenohBus(session, topics.ANYONE, namespace)
         try:
             reply: PlaceReply = bus.request(topics.PLACE, PlaceQuery(content, top_k), timeout_s)

@@ -14,6 +14,8 @@ Matrix = NDArray[np.float64]
 
 # Rotations written with few digits are still meant as rotations.
 DETERMINANT_TOLERANCE = 0.01
+# Beyond it squares lose what counts: no camera was ever there.
+FARTHEST_M = 1e12
 
 
 class TrajectoryError(SeamarkError):
@@ -62,7 +64,8 @@ def load_kitti(path: Path, times: Path | None = None, rate_hz: float = 10.0) -> 
         raise TrajectoryError(f"{path} has {len(rows)} poses but {times} has {len(stamps)} times")
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :] = values.reshape(-1, 3, 4)
-    rigid = np.isfinite(values).all(axis=1) & (np.abs(np.linalg.det(T[:, :3, :3]) - 1) < DETERMINANT_TOLERANCE)
+    rigid = (np.abs(values) < FARTHEST_M).all(axis=1)
+    rigid[rigid] = np.abs(np.linalg.det(T[rigid, :3, :3]) - 1) < DETERMINANT_TOLERANCE
     if not rigid.all():
         raise TrajectoryError(f"{path}, line {rows[int(np.argmin(rigid))][0]}: this is not a rigid motion")
     return _sorted(stamps, np.stack([se3.orthonormalise(one) for one in T]))
@@ -74,7 +77,7 @@ def load_times(path: Path) -> NDArray[np.int64]:
 
 
 def _trajectory(stamps: NDArray[np.int64], positions: Matrix, quaternions: Matrix) -> Trajectory:
-    good = (np.linalg.norm(quaternions, axis=1) > 0.5) & np.isfinite(positions).all(axis=1)
+    good = (np.linalg.norm(quaternions, axis=1) > 0.5) & (np.abs(positions) < FARTHEST_M).all(axis=1)  # NaN is not
     T = np.tile(np.eye(4), (int(good.sum()), 1, 1))
     T[:, :3, :3] = se3.from_quaternion(quaternions[good])
     T[:, :3, 3] = positions[good]

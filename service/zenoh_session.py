@@ -1,6 +1,7 @@
 """Zenoh sessions and who is alive on them. Endpoints are always explicit: nothing is searched for on the network."""
 
 import json
+import re
 import socket
 import threading
 import time
@@ -16,6 +17,8 @@ from seamark.service.wire import MAX_MESSAGE_BYTES
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 7447
 CONNECT_TIMEOUT_S = 10.0
+# For those who ask a service that should be there already.
+CLIENT_CONNECT_TIMEOUT_S = 2.0
 # What the router lets pass, also through shared memory; the margin is for keys and attachments.
 SIZE_LIMIT_BYTES = MAX_MESSAGE_BYTES + 65536
 
@@ -60,7 +63,9 @@ def open_session(
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = ", ".join([*listen, *connect])
-        raise SessionError(f"cannot open a Zenoh {mode} at {where}: {error}") from error
+        # Zenoh's own words end every clause with the line of its source.
+        words = re.sub(r" at /\S+\.rs:\d+\.?", "", str(error))
+        raise SessionError(f"cannot open a Zenoh {mode} at {where}: {words}") from error
 
 
 def free_endpoint() -> str:
@@ -68,6 +73,12 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return f"tcp/{LOOPBACK}:{probe.getsockname()[1]}"
+
+
+def who_lives(session: Any, namespace: str) -> list[str]:
+    """Return the names of the nodes that are alive now."""
+    replies = session.liveliness().get(live_key(namespace, "*"))
+    return sorted(str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
 
 
 class Watch:

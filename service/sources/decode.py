@@ -13,6 +13,8 @@ from seamark import SeamarkError
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE = b"\xff\xd8"
 END_OF_IMAGE = 0xD9
+# A small file may claim to be a huge image, which would keep a node busy for minutes.
+MAX_PIXELS = 2**26
 START_OF_SCAN = 0xDA
 # The next marker inside entropy-coded data: FF00 is a stuffed byte, FFD0 to FFD7 are restarts, FFFF is padding.
 MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
@@ -68,6 +70,7 @@ def decode(data: bytes, name: str) -> NDArray[np.generic]:
     if data.startswith(JPEG_SIGNATURE) and not jpeg_complete(data):
         raise UnreadableImageError(f"{name} is truncated: its end-of-image marker is missing")
     if data.startswith(PNG_SIGNATURE):
+        _check_size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), name)
         _check_png(data, name)
     try:
         image: NDArray[np.generic] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -75,6 +78,7 @@ def decode(data: bytes, name: str) -> NDArray[np.generic]:
         raise UnreadableImageError(f"{name} cannot be decoded: {error.err}") from error
     if image is None or image.size == 0:
         raise UnreadableImageError(f"{name} cannot be decoded as an image")
+    _check_size(image.shape[1], image.shape[0], name)
     return image
 
 
@@ -100,6 +104,11 @@ def jpeg_complete(data: bytes) -> bool:
                 return False
             position = following.start()
     return False
+
+
+def _check_size(width: int, height: int, name: str) -> None:
+    if width * height > MAX_PIXELS:
+        raise UnreadableImageError(f"{name} has {width} x {height} pixels; {MAX_PIXELS} in all are the most")
 
 
 def _check_png(data: bytes, name: str) -> None:
