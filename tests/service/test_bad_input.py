@@ -128,7 +128,7 @@ def test_second_picture_of_another_size(tmp_path: Path, what: str, field: str) -
 
 
 def test_small_file_that_claims_a_huge_image() -> None:
-    """Test: a PNG of a few bytes whose header says 20000 x 20000. Expected: UnreadableImageError before it is decoded."""
+    """Test: a PNG whose header alone says 20000 x 20000. Expected: UnreadableImageError that says so."""
     header = b"IHDR" + struct.pack(">IIBBBBB", 20000, 20000, 8, 0, 0, 0, 0)
     chunks = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     with pytest.raises(UnreadableImageError, match="20000 x 20000 pixels"):
@@ -146,7 +146,7 @@ def test_a_map_has_one_writer(tmp_path: Path) -> None:
 
 
 def test_geometry_when_opencv_asserts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Test: OpenCV's robust estimator asserts, as 5.0 does for almost equal images. Expected: a verdict all the same."""
+    """Test: OpenCV's estimator asserts, as 5.0 does for almost equal images. Expected: a verdict all the same."""
     rng = np.random.default_rng(1)
     points = rng.uniform(10, 300, (60, 2)).astype(np.float32)
     features = Features(
