@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.features import grey_of
 from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.pose import estimate_pose, motion_covariance
-from seamark.frontend.session import Session, Tracks
+from seamark.frontend.session import Session
+from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import TwoView, initialise
 from seamark.frontend.types import Filled, Frame
 
@@ -108,12 +110,14 @@ def insert_first_keyframes(
     a = builder.request(initialiser.first, session.id, None, T_odom_first, None)
     session.tracks = first.tracks[np.isin(first.tracks.ids, live.ids)]
     unknown = np.full(len(session.tracks), np.nan)
-    session.insert_keyframe(a.id, first.stamp_ns, T_odom_first, unknown, unknown)
+    session.insert_keyframe(a.id, first.stamp_ns, grey_of(initialiser.first.image), T_odom_first, unknown, unknown)
 
     session.tracks = live
     session.add_corners(grey)
     unknown = np.full(len(session.tracks), np.nan)
-    session.insert_keyframe(builder.next_id, frame.stamp_ns, T_odom_first @ two_view.T_first_second, unknown, unknown)
+    session.insert_keyframe(
+        builder.next_id, frame.stamp_ns, grey, T_odom_first @ two_view.T_first_second, unknown, unknown
+    )
     session.velocity = np.eye(4)
     session.last_pose_stamp_ns = frame.stamp_ns
     covariance = motion_covariance(T_odom_first, session.T_odom_cam, np.zeros((6, 6)))

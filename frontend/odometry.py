@@ -17,7 +17,8 @@ from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.monocular import MonoInitialiser, insert_first_keyframes
 from seamark.frontend.pose import PoseEstimate, motion_covariance
 from seamark.frontend.recovery import recover
-from seamark.frontend.session import Session, Tracks
+from seamark.frontend.session import Session
+from seamark.frontend.tracks import Tracks
 from seamark.frontend.types import Frame, Keyframe, Mode, Odometry, Outcome, Quality, Rig
 
 MIN_CORNERS = 40  # a session needs something to see
@@ -138,9 +139,10 @@ class Frontend:
     ) -> int:
         """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way."""
         previous = session.window[-1] if session.window else None
+        session.revisit(grey)
         session.add_corners(grey)
         depths = self._sensor.inverse_depth(frame, session.tracks.pixels)
-        session.insert_keyframe(self._builder.next_id, frame.stamp_ns, session.T_odom_cam, *depths)
+        session.insert_keyframe(self._builder.next_id, frame.stamp_ns, grey, session.T_odom_cam, *depths)
         motion = None
         if previous is not None and covariance is not None:
             motion = motion_covariance(previous.T_odom_cam, session.T_odom_cam, covariance)

@@ -1,6 +1,6 @@
 """One session's tracking state: live tracks, landmarks, and the window of recent keyframes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,8 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.corners import detect_corners
 from seamark.frontend.pose import Observations
+from seamark.frontend.revisit import find_again, worth_revisiting
+from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import normalised_rays, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
 
@@ -17,30 +19,13 @@ OUTLIER_PX = 4.0
 FAR_RELATIVE_SIGMA = 0.35  # a first depth less certain than this waits for triangulation
 
 
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """Corners followed up to the last frame: ``ids`` (N,) int64 ascending, ``pixels`` (N, 2) float32 as seen."""
-
-    ids: NDArray[np.int64]
-    pixels: NDArray[np.float32]
-
-    @staticmethod
-    def none() -> "Tracks":
-        """Return no tracks."""
-        return Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-
-    def __len__(self) -> int:
-        """Return the number of tracks."""
-        return len(self.ids)
-
-    def __getitem__(self, keep: NDArray[np.bool_]) -> "Tracks":
-        """Select by mask."""
-        return Tracks(self.ids[keep], self.pixels[keep])
-
-
 @dataclass(eq=False)
 class Session:
-    """Mutable state between frames. ``velocity`` is T_last_next of the last step; ``reference`` the newest keyframe."""
+    """Mutable state between frames.
+
+    ``velocity`` is T_last_next of the last step, ``reference`` the newest keyframe, ``archive`` those that have left
+    the window, and ``anchors`` the archived ones whose landmarks the newest keyframe sees again.
+    """
 
     id: int
     config: FrontendConfig
@@ -50,6 +35,8 @@ class Session:
     tracks: Tracks = field(default_factory=Tracks.none)
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     window: list[WindowKeyframe] = field(default_factory=list)
+    archive: list[WindowKeyframe] = field(default_factory=list)
+    anchors: list[WindowKeyframe] = field(default_factory=list)
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     last_pose_stamp_ns: int = 0
     n_at_keyframe: int = 0
@@ -64,9 +51,7 @@ class Session:
         """Give ids to new corners (N, 2) and append them to the live tracks; returns the new ones."""
         fresh = Tracks(np.arange(self.next_track_id, self.next_track_id + len(pixels)), pixels.astype(np.float32))
         self.next_track_id += len(pixels)
-        self.tracks = Tracks(
-            np.concatenate([self.tracks.ids, fresh.ids]), np.vstack([self.tracks.pixels, fresh.pixels])
-        )
+        self.tracks = self.tracks + fresh
         return fresh
 
     def add_corners(self, grey: NDArray[np.uint8]) -> None:
@@ -97,26 +82,45 @@ class Session:
         pixels = self.camera.undistort(tracks.pixels)
         return Observations(positions[known], pixels[known], inverse_depth[known], inverse_sigma[known]), known
 
+    def revisit(self, grey: NDArray[np.uint8]) -> None:
+        """Take up landmarks of archived keyframes that the current grey image shows again."""
+        self.anchors = []
+        live = self.landmarks.get(self.tracks.ids)
+        live = live[np.isfinite(live[:, 0])]
+        if not self.archive or len(live) == 0:
+            return
+        depth = float(np.median(se3.transform(se3.inverse(self.T_odom_cam), live)[:, 2]))
+        for old in worth_revisiting(self.archive, self.T_odom_cam, depth, self.config):
+            positions = self.landmarks.get(old.track_ids)
+            found = find_again(old, positions, grey, self.T_odom_cam, self.camera, self.tracks, self.config)
+            self.tracks = self.tracks + found
+            if np.isin(old.track_ids, self.tracks.ids).sum() >= self.config.revisit_min_landmarks:
+                self.anchors.append(old)
+
     def insert_keyframe(
         self,
         keyframe_id: int,
         stamp_ns: int,
+        grey: NDArray[np.uint8],
         T_odom_cam: NDArray[np.float64],
         inverse_depth: NDArray[np.float64],
         inverse_sigma: NDArray[np.float64],
     ) -> None:
-        """Add the live tracks as a keyframe: new landmarks from depth or parallax, then adjust the window."""
-        pixels = self.camera.undistort(self.tracks.pixels)
+        """Add the live tracks, seen in a grey image, as a keyframe: new landmarks, then the window adjusted."""
+        ids, seen = self.tracks.ids, self.tracks.pixels
+        pixels = self.camera.undistort(seen)
         self.window.append(
-            WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, self.tracks.ids, pixels, inverse_depth, inverse_sigma)
+            WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, grey, ids, seen, pixels, inverse_depth, inverse_sigma)
         )
         self._landmarks_from_parallax()
-        del self.window[: -self.config.window_keyframes]
+        while len(self.window) > self.config.window_keyframes:
+            self.archive.append(self.window.pop(0))
+        del self.archive[: max(0, len(self.archive) - self.config.archive_keyframes)]
         self.adjust_window()
         self._landmarks_from_depth()  # after the adjustment: they hang on this keyframe's pose alone
         self.T_odom_cam = self.reference.T_odom_cam
         self.n_at_keyframe = int(np.isfinite(self.landmarks.get(self.tracks.ids)[:, 0]).sum())
-        self.landmarks.retain(np.concatenate([k.track_ids for k in self.window]))
+        self.landmarks.retain(np.concatenate([k.track_ids for k in (*self.window, *self.archive)]))
 
     def _landmarks_from_depth(self) -> None:
         newest = self.reference
@@ -155,11 +159,13 @@ class Session:
             todo[mine[good]] = False
 
     def adjust_window(self) -> None:
-        """Bundle-adjust the window and forget landmarks that do not fit; the oldest poses hold the gauge."""
+        """Bundle-adjust the window and forget landmarks that do not fit; anchors and the oldest poses hold the
+        gauge.
+        """
         n_fixed = 1 if self.metric or len(self.window) == 2 else 2
         if len(self.window) <= n_fixed:
             return
-        problem, track_ids = self._bundle_problem(n_fixed)
+        problem, track_ids = self._bundle_problem([*self.anchors, *self.window], len(self.anchors) + n_fixed)
         if problem is None:
             return
         c = self.config
@@ -170,14 +176,14 @@ class Session:
         worst = np.maximum.reduceat(result.errors_px, starts)
         positions = np.where((worst < OUTLIER_PX)[:, None], result.landmarks, np.nan)
         self.landmarks.set(track_ids, positions)
-        self.window = [
-            WindowKeyframe(k.id, k.stamp_ns, T, k.track_ids, k.pixels, k.inverse_depth, k.inverse_sigma)
-            for k, T in zip(self.window, result.poses, strict=True)
-        ]
+        adjusted = result.poses[len(self.anchors) :]
+        self.window = [replace(k, T_odom_cam=T) for k, T in zip(self.window, adjusted, strict=True)]
 
-    def _bundle_problem(self, n_fixed: int) -> tuple[BundleProblem | None, NDArray[np.int64]]:
-        keyframe_of = np.concatenate([np.full(len(k.track_ids), i) for i, k in enumerate(self.window)])
-        ids = np.concatenate([k.track_ids for k in self.window])
+    def _bundle_problem(
+        self, views: list[WindowKeyframe], n_fixed: int
+    ) -> tuple[BundleProblem | None, NDArray[np.int64]]:
+        keyframe_of = np.concatenate([np.full(len(k.track_ids), i) for i, k in enumerate(views)])
+        ids = np.concatenate([k.track_ids for k in views])
         unique, landmark_of, count = np.unique(ids, return_inverse=True, return_counts=True)
         positions = self.landmarks.get(unique)
         wanted = np.isfinite(positions[:, 0]) & (count >= 2)
@@ -186,15 +192,15 @@ class Session:
         renumber = np.cumsum(wanted) - 1
         use = np.flatnonzero(wanted[landmark_of])
         use = use[np.argsort(landmark_of[use], kind="stable")]
-        pixels = np.vstack([k.pixels for k in self.window])[use]
+        pixels = np.vstack([k.pixels for k in views])[use]
         measured = Observations(
             landmarks=np.zeros((len(use), 3)),
             pixels=pixels,
-            inverse_depth=np.concatenate([k.inverse_depth for k in self.window])[use],
-            inverse_sigma=np.concatenate([k.inverse_sigma for k in self.window])[use],
+            inverse_depth=np.concatenate([k.inverse_depth for k in views])[use],
+            inverse_sigma=np.concatenate([k.inverse_sigma for k in views])[use],
         )
         problem = BundleProblem(
-            poses=np.stack([k.T_odom_cam for k in self.window]),
+            poses=np.stack([k.T_odom_cam for k in views]),
             n_fixed=n_fixed,
             landmarks=positions[wanted],
             keyframe_of=keyframe_of[use],

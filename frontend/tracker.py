@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from seamark.frontend import flow, se3
 from seamark.frontend.depth import DepthImage, DepthSensor
 from seamark.frontend.pose import PoseEstimate, estimate_pose
-from seamark.frontend.session import Session, Tracks
+from seamark.frontend.session import Session
+from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import rotation_compensated_parallax
 from seamark.frontend.types import Frame
 

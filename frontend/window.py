@@ -22,14 +22,16 @@ RELATIVE_DECREASE = 1e-4
 class WindowKeyframe:
     """What the window keeps of a keyframe: its pose and what it saw.
 
-    ``track_ids`` (M,) int64 ascending, ``pixels`` (M, 2) ideal, ``inverse_depth`` and ``inverse_sigma`` (M,) NaN where
-    unknown.
+    ``track_ids`` (M,) int64, ``seen`` (M, 2) float32 pixels as seen in ``grey`` (H, W), ``pixels`` (M, 2) the ideal
+    ones, ``inverse_depth`` and ``inverse_sigma`` (M,) NaN where unknown.
     """
 
     id: int
     stamp_ns: int
     T_odom_cam: NDArray[np.float64]
+    grey: NDArray[np.uint8]
     track_ids: NDArray[np.int64]
+    seen: NDArray[np.float32]
     pixels: NDArray[np.float64]
     inverse_depth: NDArray[np.float64]
     inverse_sigma: NDArray[np.float64]

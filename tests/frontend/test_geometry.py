@@ -207,14 +207,17 @@ def test_landmark_table_holds_what_it_is_told_to_keep() -> None:
 
 def test_a_track_that_never_ends_does_not_make_a_session_grow() -> None:
     """Test: dirt on the lens is tracked for 80 keyframes, all else for 3. Expected: the state stays bounded."""
-    session = Session(0, FrontendConfig(window_keyframes=3, window_iterations=1), CAMERA, True, np.eye(4))
+    config = FrontendConfig(window_keyframes=3, window_iterations=1, archive_keyframes=2)
+    session = Session(0, config, CAMERA, True, np.eye(4))
+    grey = np.zeros((480, 640), np.uint8)
     rng = np.random.default_rng(6)
     for k in range(80):
         session.tracks = session.tracks[(session.tracks.ids == 0) | (session.tracks.ids > 40 * (k - 3))]
         session.new_tracks(rng.uniform(0, 480, (40, 2)).astype(np.float32))
         depth = np.full(len(session.tracks), np.nan)
         depth[1:] = 0.5
-        session.insert_keyframe(k, k, np.eye(4), depth, np.full(len(depth), 0.01))
+        session.insert_keyframe(k, k, grey, np.eye(4), depth, np.full(len(depth), 0.01))
     assert session.tracks.ids[0] == 0
     assert session.next_track_id == 3200
+    assert len(session.archive) == 2
     assert 100 < len(session.landmarks) < 400
