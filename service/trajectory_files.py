@@ -64,7 +64,8 @@ def load_kitti(path: Path, times: Path | None = None, rate_hz: float = 10.0) -> 
         raise TrajectoryError(f"{path} has {len(rows)} poses but {times} has {len(stamps)} times")
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :] = values.reshape(-1, 3, 4)
-    sane = np.where((np.abs(values) < FARTHEST_M).all(axis=1)[:, None, None], T[:, :3, :3], 0)
+    sane = T[:, :3, :3].copy()
+    sane[~(np.abs(values) < FARTHEST_M).all(axis=1)] = 0
     rigid = np.abs(np.linalg.det(sane) - 1) < DETERMINANT_TOLERANCE
     if not rigid.all():
         raise TrajectoryError(f"{path}, line {rows[int(np.argmin(rigid))][0]}: this is not a rigid motion")

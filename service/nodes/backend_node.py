@@ -51,6 +51,7 @@ class BackendNode:
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
         self._known: set[int] = set()
+        self._refused: set[int] = set()
         self._next_keyframe_id = 0
         self._next_session = 0
         self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
@@ -115,18 +116,29 @@ class BackendNode:
                 self._meter.count("keyframes_again")
                 return
             if self._store is not None:
-                with self._meter.timed("store"):
-                    self._store.add_keyframe(keyframe)
+                try:
+                    with self._meter.timed("store"):
+                        self._store.add_keyframe(keyframe)
+                except MapError:
+                    self._refuse(keyframe.id)
+                    raise
             self._remember(keyframe)
             self._waiting[keyframe.id] = keyframe
             self._settled = False
             self._meter.count("keyframes")
             self._map_ready()
 
+    def _refuse(self, keyframe_id: int) -> None:
+        """Let nobody wait for a keyframe that the disk has refused."""
+        self._refused.add(keyframe_id)
+        if keyframe_id in self._candidates:
+            self._candidates.pop(keyframe_id)[1].set_result(None)
+
     def _on_candidates(self, candidates: Candidates) -> "Future[None] | None":
         keyframe_id = candidates.query_id
         with self._lock:
-            if keyframe_id in self._known and keyframe_id not in self._waiting:
+            mapped_before = keyframe_id in self._known and keyframe_id not in self._waiting
+            if mapped_before or keyframe_id in self._refused:
                 self._meter.count("candidates_again")
                 return None
             mapped: Future[None] = Future()

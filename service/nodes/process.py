@@ -5,10 +5,12 @@ even when the parent was killed.
 """
 
 import logging
+import os
 import pickle
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import BinaryIO, Protocol
 
@@ -21,6 +23,7 @@ from seamark.service.zenoh_bus import ZenohBus
 from seamark.service.zenoh_session import announce, open_session
 
 EXIT_FAILED = 1
+ORPHAN_PATIENCE_S = 30.0
 EXIT_BUG = 70  # sysexits.h: internal software error
 
 
@@ -97,3 +100,5 @@ def _follow_parent(stop: threading.Event) -> None:
         while stream.read(1024):
             pass
     stop.set()
+    time.sleep(ORPHAN_PATIENCE_S)
+    os._exit(EXIT_FAILED)  # it waits for acknowledgements of nodes that have gone too
