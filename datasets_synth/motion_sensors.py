@@ -130,17 +130,20 @@ class Motion:
 
     def __init__(self, stamps_ns: NDArray[np.int64], T_world_cam: Array, breaks: list[int] | None = None) -> None:
         ends = [0, *(breaks or []), len(stamps_ns)]
-        if len(stamps_ns) != len(T_world_cam) or min(np.diff(ends)) < 2:
+        if len(stamps_ns) != len(T_world_cam) or np.any(np.diff(ends) < 1):
             raise SeamarkError(
-                f"a motion needs as many stamps as poses and two between teleports; there are {len(stamps_ns)} and "
-                f"{len(T_world_cam)}"
+                f"a motion needs as many stamps as poses, and teleports {breaks or []} between them; there are "
+                f"{len(stamps_ns)} stamps and {len(T_world_cam)} poses"
             )
         self.stamps_ns = stamps_ns
         T_world_body = T_world_cam @ se3.inverse(se3.T_WORLD_LEVEL_CAM)
         since = (stamps_ns - stamps_ns[0]) / NANOSECONDS
         self._parts: list[tuple[float, float, PoseSpline]] = []
         for begin, end in itertools.pairwise(ends):
-            spline = through_poses(since[begin:end], T_world_body[begin:end])
+            knots, poses = since[begin:end], T_world_body[begin:end]
+            if end - begin == 1:  # it stands there and is carried on
+                knots, poses = np.array([knots[0], knots[0] + 1]), np.repeat(poses, 2, axis=0)
+            spline = through_poses(knots, poses)
             self._parts.append((float(since[begin]), float(since[end - 1]), spline))
 
     def stamps(self, rate_hz: float) -> NDArray[np.int64]:

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from seamark import SeamarkError
-from seamark.datasets_synth import fallback, folder, sensor, specification, trajectory
+from seamark.datasets_synth import fallback, folder, scenarios, sensor, specification, toy_names, trajectory
 from seamark.datasets_synth.rendering import NoVulkanDevice, RenderPool, require_renderer
 from seamark.datasets_synth.sequence import GroundTruth, SynthSequence
 from seamark.datasets_synth.specification import Specification
 from seamark.frontend.types import Frame
 
-__all__ = ["NoVulkanDevice", "SynthSequence", "default_cache_dir", "open_synth"]
+__all__ = ["NoVulkanDevice", "SynthSequence", "cache_folder", "default_cache_dir", "open_synth"]
 
 
 def default_cache_dir() -> Path:
@@ -26,18 +26,26 @@ def default_cache_dir() -> Path:
     return Path.home() / ".cache" / "seamark"
 
 
-def open_synth(spec: str, *, cache_dir: Path | None = None) -> SynthSequence:
-    """Return the sequence that ``spec`` names: ``WORLD[,key=value...]``, or ``small_loop``, which needs no renderer.
+def cache_folder(wanted: Specification, cache_dir: Path | None = None) -> Path:
+    """Return the folder in which the frames of a specification are kept once all of them have been rendered."""
+    root = default_cache_dir() if cache_dir is None else cache_dir
+    return root / "synth" / specification.content_hash(wanted)
 
-    Frames are rendered in worker processes when ``frames()`` is first iterated, and kept under ``cache_dir``/synth once
-    a pass is complete. Raises SeamarkError for unknown names, listing those that exist, and NoVulkanDevice where the
-    sequence is not in the cache and nothing can render it.
+
+def open_synth(spec: str, *, cache_dir: Path | None = None) -> SynthSequence:
+    """Return the sequence that ``spec`` names: ``NAME[,key=value...]`` with the name of a scenario or of a world.
+
+    ``toy`` and ``small_loop`` need no renderer. Frames of the others are rendered in worker processes when ``frames()``
+    is first iterated, and kept under ``cache_dir``/synth once a pass is complete. Raises SeamarkError for unknown
+    names, listing those that exist, and NoVulkanDevice where the sequence is not in the cache and nothing can render.
     """
     if spec == fallback.NAME:
         return fallback.open_small_loop()
-    wanted = specification.parse(spec)
-    root = (default_cache_dir() if cache_dir is None else cache_dir) / "synth"
-    finished = root / specification.content_hash(wanted)
+    text = scenarios.expand(spec)
+    if toy_names.is_toy(text):
+        return toy_names.parse(text).open()
+    wanted = specification.parse(text)
+    finished = cache_folder(wanted, cache_dir)
     if not finished.is_dir():
         require_renderer()
     truth = GroundTruth(trajectory.stamps(wanted.frames, specification.FPS), wanted.poses())
@@ -47,7 +55,8 @@ def open_synth(spec: str, *, cache_dir: Path | None = None) -> SynthSequence:
             return folder.read_frames(finished, truth.stamps_ns)
         return _render(wanted, finished, truth)
 
-    return SynthSequence(wanted.world, wanted.rig, wanted.mode, wanted.frames, truth, frames)
+    name = wanted.world if text == spec else spec.split(",")[0].strip()
+    return SynthSequence(name, wanted.rig, wanted.mode, wanted.frames, truth, frames)
 
 
 def _render(wanted: Specification, finished: Path, truth: GroundTruth) -> Iterator[Frame]:

@@ -159,7 +159,13 @@ def test_same_seed_same_bits() -> None:
         assert any(getattr(first, name).tobytes() != getattr(other, name).tobytes() for name in parts)
 
 
-def test_a_motion_needs_two_frames_between_teleports() -> None:
+def test_teleports_lie_between_frames() -> None:
     poses = np.repeat(np.eye(4)[None], 5, axis=0)
-    with pytest.raises(SeamarkError, match="two between teleports"):
-        Motion(trajectory.stamps(5, FPS), poses, [2, 3])
+    poses[2:, 0, 3], poses[3:, 0, 3] = 10.0, 20.0
+    motion = Motion(trajectory.stamps(5, FPS), poses, [2, 3])  # one frame alone between two teleports
+    assert np.allclose(motion.poses(motion.stamps_ns), poses @ se3.inverse(se3.T_WORLD_LEVEL_CAM))
+    assert np.abs(motion.rates(motion.stamps(200.0))[1]).max() < 1e-9
+    with pytest.raises(SeamarkError, match="teleports"):
+        Motion(trajectory.stamps(5, FPS), poses, [2, 2])
+    with pytest.raises(SeamarkError, match="5 stamps and 4 poses"):
+        Motion(trajectory.stamps(5, FPS), poses[:4])
