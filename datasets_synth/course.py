@@ -18,6 +18,7 @@ TICK_S = 0.02
 STEP_M = 0.02
 SIGMA_PER_RADIUS = 0.7  # of the Gaussian that cuts a corner no deeper than an arc of that radius would
 PAUSE_S = 0.7
+RAMP_S = 0.5  # in which a turn on the spot comes to its rate
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,12 @@ def drive(path: Array, limits: Limits) -> Array:
 
 def turn(before: Array, angle_rad: float, limits: Limits) -> Array:
     """Return the piece that turns on the spot where ``before`` ends, standing still before and after."""
-    duration = max(0.5, 1.875 * abs(angle_rad) / limits.turn_rad_s)  # 1.875: the steepest slope of the polynomial
-    f = np.linspace(0, 1, int(np.ceil(duration / TICK_S)) + 1)
-    piece = np.repeat(before[-1:], len(f), axis=0)
-    piece[:, 3] += angle_rad * (10 * f**3 - 15 * f**4 + 6 * f**5)
+    plateau = max(0.0, abs(angle_rad) / limits.turn_rad_s - RAMP_S)
+    times = np.arange(int(np.ceil((plateau + 2 * RAMP_S) / TICK_S)) + 1) * TICK_S
+    rate = np.clip(np.minimum(times, plateau + 2 * RAMP_S - times) / RAMP_S, 0, 1)
+    turned = np.cumsum(rate) / rate.sum()
+    piece = np.repeat(before[-1:], len(turned), axis=0)
+    piece[:, 3] += angle_rad * turned
     return np.concatenate([pause(before), piece, pause(piece)])
 
 

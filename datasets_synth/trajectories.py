@@ -89,7 +89,8 @@ def _figure_eight(route: Route, limits: Limits, _: np.random.Generator) -> list[
 
 
 def _there_and_back(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    path = course.lap(route)
+    """To the end of an open route, half round a closed one."""
+    path = course.part(course.lap(route), 0, 0.5 if route.closed else 1)
     there = course.drive(path, limits)
     around = course.turn(there, np.pi, limits)
     return [course.joined([there, around, course.drive(path[::-1], limits)])]
@@ -146,9 +147,9 @@ def _stop_and_go(route: Route, limits: Limits, rng: np.random.Generator) -> list
 
 def _pure_rotation(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
     """Drive so that a map can begin, turn once round about the optical centre, drive on, turn once round back."""
-    path = course.lap(route, _overlap_m(route))
+    path = course.lap(route)
     pieces = [course.drive(course.part(path, 0, 0.2), limits)]
-    for start, end, angle in ((0.2, 0.6, 2 * np.pi), (0.6, 1.0, -2 * np.pi)):
+    for start, end, angle in ((0.2, 0.4, 2 * np.pi), (0.4, 0.5, -2 * np.pi)):
         pieces.append(course.turn(pieces[-1], angle, limits))
         pieces.append(course.drive(course.part(path, start, end), limits))
     return [course.joined(pieces)]
@@ -157,7 +158,7 @@ def _pure_rotation(route: Route, limits: Limits, _: np.random.Generator) -> list
 def _kidnap(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
     """Carried ahead to a place not seen yet, then back to one that has been seen; stamps go on."""
     path = course.lap(route, _overlap_m(route))
-    shares = ((0.0, 0.45), (0.7, 1.0), (0.25, 0.6))
+    shares = ((0.0, 0.4), (0.7, 1.0), (0.2, 0.45))
     return [course.drive(course.part(path, *share), limits) for share in shares]
 
 
@@ -183,7 +184,7 @@ KINDS: dict[str, Kind] = {
     "loop": Kind("once round and a little more", _loop),
     "once": Kind("from one end to the other", _once),
     "figure_eight": Kind("a way that crosses itself; needs an open area", _figure_eight, leaves_route=True),
-    "there_and_back": Kind("to the end, about turn, back in the opposite direction", _there_and_back),
+    "there_and_back": Kind("to the end or half round, about turn, back in the opposite direction", _there_and_back),
     "lawn_mower": Kind("lanes side by side in alternating directions", _lawn_mower, leaves_route=True),
     "hand_held": Kind("once round with the jitter of a hand", _round, HAND, 1.3, 4.0, 1.5),
     "six_dof": Kind("once round, rising, sinking, nodding and rolling", _round, FLIGHT, 1.3, 2.0, 1.2),
