@@ -9,6 +9,7 @@ from pathlib import Path
 
 from seamark import SeamarkError
 from seamark.datasets_synth import fallback, folder, scenarios, sensor, specification, toy_names, trajectory
+from seamark.datasets_synth.clearance import require_clear
 from seamark.datasets_synth.rendering import NoVulkanDevice, RenderPool, require_renderer
 from seamark.datasets_synth.sequence import GroundTruth, SynthSequence
 from seamark.datasets_synth.specification import Specification
@@ -47,6 +48,7 @@ def open_synth(spec: str, *, cache_dir: Path | None = None) -> SynthSequence:
     wanted = specification.parse(text)
     finished = cache_folder(wanted, cache_dir)
     if not finished.is_dir():
+        require_clear(wanted)
         require_renderer()
     truth = GroundTruth(trajectory.stamps(wanted.frames, specification.FPS), wanted.poses())
 

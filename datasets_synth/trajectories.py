@@ -18,7 +18,8 @@ from seamark.frontend import se3
 SMOOTHING_S = 0.12  # sigma of the Gaussian over time that rounds changes of acceleration
 RESERVE = 0.92  # of the limits is used for driving, the rest is for sway and jitter
 CHECK_S = 0.01
-MOST_LANES = 5
+MOST_LANES = 4
+EIGHT_INSIDE, MOWER_INSIDE = 0.5, 0.65  # how much of the extent of a closed route ways use that leave it
 WAVES_M = np.array([7.3, 5.9, 4.7, 6.7, 8.9])  # lengths of the sway over the way travelled
 SWAY = np.array([0.05, 0.015, np.deg2rad(2.0), np.deg2rad(1.2), np.deg2rad(0.8)])  # side, lift, yaw, pitch, roll
 
@@ -83,7 +84,8 @@ def _figure_eight(route: Route, limits: Limits, _: np.random.Generator) -> list[
     """The second half of the corners in reverse order: the way crosses itself in the middle."""
     _require_closed(route, "figure_eight")
     half = (len(route.waypoints) + 1) // 2
-    crossed = np.concatenate([route.waypoints[:half], route.waypoints[half:][::-1]])
+    corners = _inside(route, EIGHT_INSIDE)
+    crossed = np.concatenate([corners[:half], corners[half:][::-1]])
     eight = Route(route.name, crossed, True, route.corner_radius_m, route.speed_m_s)
     return [course.drive(course.lap(eight, _overlap_m(eight)), limits)]
 
@@ -106,7 +108,8 @@ def _lawn_mower(route: Route, limits: Limits, _: np.random.Generator) -> list[Ar
             pieces.append(course.turn(pieces[-1], np.pi, limits))
             pieces.append(course.drive(way if lane % 2 else way[::-1], limits))
         return [_bridged(pieces, limits)]
-    low, high = route.waypoints.min(axis=0), route.waypoints.max(axis=0)
+    area = _inside(route, MOWER_INSIDE)
+    low, high = area.min(axis=0), area.max(axis=0)
     across = int(np.argmin((high - low)[:2]))
     lanes = round(float((high - low)[across]) / max(0.8, 2 * route.clearance_m)) + 1
     count = min(MOST_LANES, max(3, lanes))
@@ -119,6 +122,12 @@ def _lawn_mower(route: Route, limits: Limits, _: np.random.Generator) -> list[Ar
     radius = min(route.corner_radius_m, 0.4 * float((high - low)[across]) / (count - 1))
     mower = Route(route.name, np.stack(corners), False, radius, route.speed_m_s)
     return [course.drive(course.lap(mower), limits)]
+
+
+def _inside(route: Route, share: float) -> Array:
+    """Return the corners (N, 3) of a closed route drawn together about their middle, at their height."""
+    middle = route.waypoints.mean(axis=0)
+    return np.asarray(middle + np.array([share, share, 1.0]) * (route.waypoints - middle))
 
 
 def _bridged(pieces: list[Array], limits: Limits) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from seamark import SeamarkError
 from seamark.datasets_synth import folder, layouts, motion_sensors, scenarios, sensor, specification, toy, toy_names
 from seamark.datasets_synth import trajectory as stamping
+from seamark.datasets_synth.clearance import require_clear
 from seamark.datasets_synth.layouts import Recording
 from seamark.datasets_synth.motion_sensors import Motion, read_gps, read_imu, read_wheels
 from seamark.datasets_synth.rendering import RenderPool, require_renderer
@@ -162,6 +163,8 @@ def _plan_world(text: str, cache_dir: Path | None) -> _Plan:
     wanted = specification.parse(text)
     truth = GroundTruth(stamping.stamps(wanted.frames, specification.FPS), wanted.poses())
     finished = cache_folder(wanted, cache_dir)
+    if not finished.is_dir():
+        require_clear(wanted)
 
     def coded(begin: int) -> Iterator[CodedFrame]:
         if finished.is_dir():
