@@ -29,7 +29,7 @@ INDOORS = {
 OUTDOORS = {
     "day": Illumination(lamps=(0, 0, 0)),
     "dusk": Illumination((0.34, 0.32, 0.40), (0.34, 0.19, 0.10), (0.5, 0.38, 0.22), (0.45, 0.33, 0.32)),
-    "night": Illumination((0.045, 0.05, 0.075), (0, 0, 0), (1.0, 0.74, 0.42), (0.012, 0.014, 0.028)),
+    "night": Illumination((0.045, 0.05, 0.075), (0, 0, 0), (1.0, 0.74, 0.42), (0.006, 0.007, 0.014)),
 }
 CONDITIONS = ("day", "dusk", "night", "changing")
 DARKENING = (0.25, 0.65, 1.0)  # shares of a changing run: until here day, here dusk, here half way to night

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from seamark.datasets_synth import world_loop
+from seamark.datasets_synth import world_hall, world_loop, world_office, world_road, world_street, world_twins
 from seamark.datasets_synth.route import Route
 from seamark.datasets_synth.world import World
 
@@ -27,4 +27,9 @@ WORLDS = {
         600,
         ("full", "small"),
     ),
+    "twins": Kind(world_twins.build_twins, world_twins.twins_route, "loop", 790),
+    "office": Kind(world_office.build_office, world_office.office_route, "loop", 885),
+    "hall": Kind(world_hall.build_hall, world_hall.hall_route, "loop", 720),
+    "street": Kind(world_street.build_street, world_street.street_route, "loop", 760),
+    "road": Kind(world_road.build_road, world_road.road_route, "once", 800),
 }

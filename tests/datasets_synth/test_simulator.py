@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from seamark.datasets_synth.rendering import NoVulkanDevice, require_renderer
+from seamark.datasets_synth import optics, sensor, specification
+from seamark.datasets_synth.rendering import NoVulkanDevice, RenderPool, require_renderer
 from seamark.datasets_synth.scenario import open_synth
 from seamark.datasets_synth.sequence import SynthSequence
 from seamark.frontend import se3
@@ -110,3 +111,36 @@ def test_stereo_disparity_agrees_with_depth(rgbd: tuple[SynthSequence, list[Fram
     assert np.median(np.abs(errors)) < 0.4
     assert abs(np.median(errors)) < 0.15
     assert abs(np.median(left[:, 1] - right[:, 1])) < 0.1
+
+
+def test_night_has_the_geometry_of_the_day(rgbd: tuple[SynthSequence, list[Frame]], tmp_path: Path) -> None:
+    night = _first(open_synth(SPEC + "rgbd,condition=night", cache_dir=tmp_path), 2)
+    for dark, bright in zip(night, rgbd[1][:2], strict=True):
+        assert dark.depth is not None and bright.depth is not None
+        assert dark.depth.tobytes() == bright.depth.tobytes()
+        assert 0.05 < dark.image.mean() / bright.image.mean() < 0.9
+
+
+def test_a_distorting_camera_sees_people_and_tells_which_pixels_they_are() -> None:
+    wanted = specification.parse(SPEC + "rgbd,camera=barrel,movers=3,labels=1")
+    with RenderPool(wanted) as pool:
+        coded = list(islice(pool.frames(), 40))
+    labels = [cv2.imdecode(np.frombuffer(frame.labels, np.uint8), cv2.IMREAD_UNCHANGED) for frame in coded]
+    assert set(np.unique(labels)) <= {0, 1, 10, 11, 12}
+    shares = [float((image >= 10).mean()) for image in labels]
+    assert 0.03 < max(shares) < 0.6
+    frames, poses = [sensor.decode(frame, 0, "") for frame in coded], wanted.poses()
+    quiet = [k for k in range(36) if shares[k] < 0.02 and shares[k + 3] < 0.02]
+    first, second = quiet[0], quiet[0] + 3
+    a, b = _matches(frames[first], frames[second].image)
+    depth = frames[first].depth
+    assert depth is not None
+    whole = np.rint(a).astype(int)
+    z = depth[whole[:, 1], whole[:, 0]] / wanted.rig.depth_factor
+    camera = wanted.rig.cam0
+    assert camera.distortion == optics.MODELS["barrel"].distortion
+    T_b_a = se3.inverse(poses[second]) @ poses[first]
+    errors = camera.project(se3.transform(T_b_a, camera.rays(a) * z[:, None])[z > 0]) - b[z > 0]
+    assert len(errors) > 60
+    assert np.median(np.linalg.norm(errors, axis=1)) < 0.5
+    assert np.all(np.abs(np.median(errors, axis=0)) < 0.25)

@@ -1,0 +1,143 @@
+"""The worlds by name: free ways through them, the same from the same seed, alike where they are meant to be."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from seamark import SeamarkError
+from seamark.datasets_synth import movers, specification, world_twins
+from seamark.datasets_synth.panels import Panel
+from seamark.datasets_synth.world import World
+from seamark.datasets_synth.worlds import WORLDS
+
+NEW = tuple(name for name in WORLDS if name != "loop")
+
+
+@pytest.fixture(scope="module")
+def worlds() -> dict[str, World]:
+    return {name: specification.parse(name).build() for name in NEW}
+
+
+def _distances(positions: np.ndarray, panel: Panel) -> np.ndarray:
+    along = [(positions - panel.corner) @ edge / (edge @ edge) for edge in (panel.right, panel.down)]
+    nearest = panel.corner + sum(
+        np.clip(share, 0, 1)[:, None] * edge for share, edge in zip(along, (panel.right, panel.down), strict=True)
+    )
+    return np.linalg.norm(positions - nearest, axis=1)
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_the_camera_keeps_clear_of_everything(name: str, worlds: dict[str, World]) -> None:
+    positions = specification.parse(name).poses()[::4, :3, 3]
+    nearest = [_distances(positions, panel).min() for panel in worlds[name].panels if not panel.sky]
+    assert 0.3 < min(nearest) < 3.0
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_a_world_depends_on_its_seed_only(name: str, worlds: dict[str, World]) -> None:
+    again, other = (specification.parse(f"{name},seed={seed}").build() for seed in (0, 1))
+    for a, b in zip(worlds[name].panels, again.panels, strict=True):
+        assert np.array_equal(a.corner, b.corner)
+        assert a.image.shape == b.image.shape
+    for k in range(0, len(again.panels), max(1, len(again.panels) // 20)):
+        assert np.array_equal(worlds[name].panels[k].image, again.panels[k].image)
+    pairs = zip(worlds[name].panels, other.panels, strict=False)
+    assert any(a.image.shape != b.image.shape or not np.array_equal(a.image, b.image) for a, b in pairs)
+    assert specification.parse(name).poses().tobytes() == specification.parse(name).poses().tobytes()
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_panels_are_rectangles_and_few(name: str, worlds: dict[str, World]) -> None:
+    panels = worlds[name].panels
+    assert 40 < len({id(panel.image) for panel in panels}) < 300
+    for panel in panels:
+        assert abs(panel.right @ panel.down) < 1e-6 * np.linalg.norm(panel.right) * np.linalg.norm(panel.down)
+        assert panel.image.dtype == np.uint8 and panel.image.flags.c_contiguous
+
+
+def test_closed_routes_close_within_their_frames() -> None:
+    for name, kind in WORLDS.items():
+        poses = specification.parse(name).poses()
+        length = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+        back = np.linalg.norm(poses[-100:, :3, 3] - poses[0, :3, 3], axis=1).min()
+        assert 50 < length < 450
+        assert (back < 5.0) == kind.route(kind.sizes[0]).closed
+
+
+def test_twins_are_alike_but_for_posters(worlds: dict[str, World]) -> None:
+    inside = [p for p in worlds["twins"].panels if abs(p.corners[:, 0].mean()) < world_twins.HALF_LENGTH_M - 0.01]
+    north = [p for p in inside if p.corners[:, 1].min() >= world_twins.INNER_M - 0.01]
+    south = [p for p in inside if p.corners[:, 1].max() <= -world_twins.INNER_M + 0.01]
+    places = {tuple(np.round([*p.corner, *p.right], 6) + 0.0): p for p in north}
+    turned = [tuple(np.round([*(p.corner * (-1, -1, 1)), *(p.right * (-1, -1, 1))], 6) + 0.0) for p in south]
+    twins = [(places[key], p) for key, p in zip(turned, south, strict=True) if key in places]
+    assert len(twins) > 20
+    shares = [float((a.image != b.image).any(axis=-1).mean()) for a, b in twins]
+    assert 0.02 < max(shares) < 0.2  # of a long wall
+    assert np.mean(np.array(shares) == 0) > 0.8
+
+
+def test_office_rooms_share_their_pictures(worlds: dict[str, World]) -> None:
+    shared = Counter(id(panel.image) for panel in worlds["office"].panels)
+    assert sum(count >= 6 for count in shared.values()) > 30  # the same in all six rooms
+    assert sum(count == 1 for count in shared.values()) > 20  # what tells them apart
+
+
+class TestPeople:
+    def test_they_are_of_human_size(self) -> None:
+        for seed in range(5):
+            panels = movers.person(np.random.default_rng(seed))
+            corners = np.concatenate([panel.corners for panel in panels])
+            assert 1.55 < corners[:, 2].max() < 1.95
+            assert abs(corners[:, 2].min()) < 1e-9
+            assert np.abs(corners[:, :2]).max() < 0.4
+
+    def test_they_walk_without_jumping_and_keep_their_distance(self) -> None:
+        poses = specification.parse("loop").poses()
+        track = movers.track(poses, 15.0, 0.75, np.random.default_rng(3))
+        here = track.present[1:] & track.present[:-1]
+        steps = np.linalg.norm(np.diff(track.position[:, :2], axis=0), axis=1)[here]
+        assert 0.5 < track.present.mean() < 0.95
+        assert np.percentile(steps, 95) * 15 < 3.5
+        away = np.linalg.norm(track.position[:, :2] - poses[:, :2, 3], axis=1)[track.present]
+        assert 0.7 < away.min() < 1.5
+        assert np.median(away) < 5
+
+    def test_the_same_seed_gives_the_same_walk(self) -> None:
+        poses = specification.parse("hall,frames=100").poses()
+        one, two = (movers.track(poses, 15.0, 1.0, np.random.default_rng(5)) for _ in range(2))
+        assert np.array_equal(one.position, two.position) and np.array_equal(one.present, two.present)
+
+
+class TestSettings:
+    def test_an_offset_moves_the_camera_to_its_left(self) -> None:
+        plain, aside = (specification.parse(f"hall,frames=40{more}").poses() for more in ("", ",offset=50"))
+        moved = np.einsum("nji,nj->ni", plain[:, :3, :3], aside[:, :3, 3] - plain[:, :3, 3])
+        assert np.allclose(moved, (-0.5, 0, 0))
+
+    def test_another_run_differs_in_the_same_world(self) -> None:
+        first, second = (specification.parse(f"loop,frames=40,run={run}") for run in (0, 1))
+        assert not np.array_equal(first.poses(), second.poses())
+        assert np.abs(first.poses()[:, :3, 3] - second.poses()[:, :3, 3]).max() < 0.5
+        assert first.seed == second.seed and first.motion_seed != second.motion_seed
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("hall,size=small", "no size=small"),
+            ("road,trajectory=lap", "it is called once"),
+            ("loop,condition=fog", "there are day, dusk, night, changing"),
+            ("loop,camera=fisheye", "there are ideal, real, barrel"),
+            ("loop,movers=9", "from 0 to 3"),
+            ("loop,offset=-200", "from -100 to 100"),
+        ],
+    )
+    def test_bad_settings_say_what_exists(self, text: str, message: str) -> None:
+        with pytest.raises(SeamarkError, match=message):
+            specification.parse(text)
+
+    def test_every_setting_changes_the_hash(self) -> None:
+        texts = ["loop", "twins", "loop,condition=night", "loop,camera=real", "loop,movers=1", "loop,offset=5"]
+        texts += ["loop,run=1", "loop,labels=1", "loop,trajectory=kidnap"]
+        assert len({specification.content_hash(specification.parse(text)) for text in texts}) == len(texts)
