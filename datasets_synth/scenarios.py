@@ -26,8 +26,82 @@ def _numbered(*rows: tuple[str, str, str, str]) -> dict[str, Scenario]:
 
 
 SCENARIOS = _numbered(
-    ("lap", "loop", "frames=600,sensors=rgbd", "one loop to close, in easy light"),
+    ("toy_loop", "toy", "frames=300,sensors=rgbd", "one loop without a simulator, in half a minute"),
+    ("lap", "loop", "frames=600,sensors=rgbd", "one loop to close in easy light"),
     ("lap_cheap", "loop", "frames=600,sensors=rgbd,sensor=cheap", "drift: depth is warped by three per cent"),
+    (
+        "first_day",
+        "loop",
+        "trajectory=loop,frames=780,sensors=stereo,camera=real",
+        "the map for second_dusk, third_night",
+    ),
+    (
+        "second_dusk",
+        "loop",
+        "trajectory=second_traversal,frames=780,sensors=stereo,camera=real,condition=dusk,run=1",
+        "the way of first_day again at dusk, aside and looking aside",
+    ),
+    (
+        "third_night",
+        "loop",
+        "trajectory=second_traversal,frames=780,sensors=stereo,camera=real,condition=night,run=2",
+        "the way of first_day again at night under lamps",
+    ),
+    (
+        "changing_light",
+        "loop",
+        "trajectory=loop,frames=780,sensors=rgbd,camera=real,condition=changing",
+        "light, exposure and gain change on the way",
+    ),
+    ("crowd", "loop", "trajectory=loop,frames=780,sensors=rgbd,movers=3", "people move through the picture"),
+    (
+        "back_again",
+        "loop",
+        "trajectory=there_and_back,size=small,frames=420,sensors=rgbd",
+        "every place again in the opposite direction: no loop until home",
+    ),
+    (
+        "stop_and_go",
+        "loop",
+        "trajectory=stop_and_go,size=small,frames=670,sensors=rgbd",
+        "standing still must add neither keyframes nor drift",
+    ),
+    (
+        "spin",
+        "loop",
+        "trajectory=pure_rotation,frames=755,sensors=mono",
+        "turns without parallax, which mono must survive",
+    ),
+    (
+        "kidnapped",
+        "loop",
+        "trajectory=kidnap,frames=800,sensors=rgbd",
+        "carried to an unknown place, then to a known one",
+    ),
+    (
+        "hand_held",
+        "loop",
+        "trajectory=hand_held,frames=725,sensors=mono,camera=barrel",
+        "jitter, motion blur and distortion",
+    ),
+    ("office_rooms", "office", "trajectory=hand_held,frames=740,sensors=rgbd", "rooms that repeat"),
+    ("twin_corridors", "twins", "frames=790,sensors=rgbd", "two corridors that look alike are different places"),
+    (
+        "hall_flight",
+        "hall",
+        "trajectory=six_dof,frames=700,sensors=stereo,camera=real",
+        "few features, all six degrees",
+    ),
+    ("hall_mower", "hall", "trajectory=lawn_mower,frames=760,sensors=rgbd", "lanes side by side with few features"),
+    ("hall_eight", "hall", "trajectory=figure_eight,frames=625,sensors=rgbd", "one place crossed in two directions"),
+    ("street_day", "street", "frames=760,sensors=stereo,camera=real", "a large loop at the pace of a car"),
+    (
+        "street_night",
+        "street",
+        "trajectory=second_traversal,frames=760,sensors=stereo,camera=real,condition=night,run=1",
+        "street_day again by night",
+    ),
+    ("road", "road", "trajectory=once,frames=800,sensors=stereo,camera=real", "no place twice: every loop is false"),
 )
 
 
