@@ -24,7 +24,7 @@ SIZES = ("full", "small")
 # Modules that rendered files do not depend on; all others are part of the content hash.
 CHANGE_NO_PICTURE = frozenset(
     {"__init__", "toy", "imagery", "fallback", "scenario", "scenarios", "sequence", "rendering", "layouts"}
-    | {"motion_sensors", "ground_truth"}
+    | {"motion_sensors", "ground_truth", "writing", "toy_names", "clearance"}
 )
 LAP = "lap"  # the trajectory that the world loop has always had, and no other world
 TRAJECTORIES = (LAP, *trajectories.KINDS)
@@ -143,7 +143,10 @@ def parse(text: str) -> Specification:
     """Return the specification that ``WORLD[,key=value...]`` stands for; raises SeamarkError listing what exists."""
     world, *settings = [part.strip() for part in text.split(",")]
     if world not in WORLDS:
-        raise SeamarkError(f"there is no synthetic world {world!r}; there are {', '.join((*WORLDS, 'small_loop'))}")
+        known = ", ".join((*WORLDS, "toy", "small_loop"))
+        raise SeamarkError(
+            f"there is no synthetic world {world!r}; there are {known}, and what seamark synth list names"
+        )
     values: dict[str, str | int] = {}
     for setting in settings:
         key, equals, value = (part.strip() for part in setting.partition("="))

@@ -13,7 +13,17 @@ from typing import IO
 import numpy as np
 
 from seamark import SeamarkError
-from seamark.datasets_synth import folder, layouts, motion_sensors, scenarios, sensor, specification, toy, toy_names
+from seamark.datasets_synth import (
+    fallback,
+    folder,
+    layouts,
+    motion_sensors,
+    scenarios,
+    sensor,
+    specification,
+    toy,
+    toy_names,
+)
 from seamark.datasets_synth import trajectory as stamping
 from seamark.datasets_synth.clearance import require_clear
 from seamark.datasets_synth.layouts import Recording
@@ -150,6 +160,8 @@ def _put(file: Path, content: bytes) -> None:
 
 def _plan(spec: str, cache_dir: Path | None) -> _Plan:
     text = scenarios.expand(spec)
+    if text.strip() == fallback.NAME:
+        raise SeamarkError(f"{fallback.NAME} is kept in layout tum at {fallback.small_loop_path()}")
     return _plan_toy(toy_names.parse(text)) if toy_names.is_toy(text) else _plan_world(text, cache_dir)
 
 
