@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from types import TracebackType
 from typing import IO, Self
@@ -49,13 +49,13 @@ def require_renderer(timeout_s: float = PROBE_TIMEOUT_S) -> str:
 class _Worker:
     """One child process and the thread that reads its frames into a bounded queue."""
 
-    def __init__(self, specification: Specification, first: int, step: int) -> None:
+    def __init__(self, specification: Specification, first: int, step: int, indices: Sequence[int] = ()) -> None:
         environment = {"LP_NUM_THREADS": "1" if step > 1 else "2", "OPENBLAS_NUM_THREADS": "1", **os.environ}
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the worker
         self._process = subprocess.Popen(
             COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, env=environment
         )
-        job = {"specification": asdict(specification), "first": first, "step": step}
+        job = {"specification": asdict(specification), "first": first, "step": step, "indices": [*indices]}
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps(job).encode() + b"\n")
@@ -165,3 +165,13 @@ class RenderPool:
         for worker in self._workers:
             worker.close()
         self._workers = []
+
+
+def render_some(specification: Specification, indices: Sequence[int]) -> Iterator[CodedFrame]:
+    """Yield the frames with the given ascending indices only; raises SeamarkError where the worker dies."""
+    worker = _Worker(specification, 0, 1, indices)
+    try:
+        for index in indices:
+            yield worker.next_frame(index)
+    finally:
+        worker.close()

@@ -49,7 +49,7 @@ def _render(job: dict[str, Any], output: BinaryIO) -> None:
     cv2.setNumThreads(1)
     specification = Specification(**job["specification"])
     studio = Studio(specification)
-    for index in range(job["first"], specification.frames, job["step"]):
+    for index in job.get("indices") or range(job["first"], specification.frames, job["step"]):
         coded = studio.frame(index)
         blobs = (coded.left, coded.right, coded.depth, coded.labels)
         output.write(HEADER.pack(index, *(len(blob) for blob in blobs)))
