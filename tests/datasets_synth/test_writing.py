@@ -173,6 +173,13 @@ class TestScenarios:
             plan = writing._plan(scenario.name, Path("/nowhere"))
             assert 300 <= len(plan.truth) <= 800
 
+    def test_the_documentation_has_the_same_table(self) -> None:
+        text = (Path(__file__).parents[2] / "docs" / "trajectories.md").read_text(encoding="utf-8")
+        rows = [line for line in text.splitlines() if line.startswith("| ") and line.split()[1].isdigit()]
+        assert rows == [
+            f"| {one.number} | `{one.name}` | `{one.text}` | {one.purpose} |" for one in scenarios.SCENARIOS.values()
+        ]
+
     def test_settings_after_the_name_take_precedence(self) -> None:
         assert scenarios.expand("lap,frames=50") == "loop,frames=50,sensors=rgbd"
         assert scenarios.expand("loop,frames=50") == "loop,frames=50"
