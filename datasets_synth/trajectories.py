@@ -1,6 +1,5 @@
 """Camera motions along the route of a world: what they are called, and the limits that they keep."""
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark import SeamarkError
-from seamark.datasets_synth import course
+from seamark.datasets_synth import ways
 from seamark.datasets_synth.course import TICK_S, Array, Limits
 from seamark.datasets_synth.route import Route
 from seamark.datasets_synth.spline import UniformSpline
@@ -18,8 +17,6 @@ from seamark.frontend import se3
 SMOOTHING_S = 0.12  # sigma of the Gaussian over time that rounds changes of acceleration
 RESERVE = 0.92  # of the limits is used for driving, the rest is for sway and jitter
 CHECK_S = 0.01
-MOST_LANES = 4
-EIGHT_INSIDE, MOWER_INSIDE = 0.5, 0.65  # how much of the extent of a closed route ways use that leave it
 WAVES_M = np.array([7.3, 5.9, 4.7, 6.7, 8.9])  # lengths of the sway over the way travelled
 SWAY = np.array([0.05, 0.015, np.deg2rad(2.0), np.deg2rad(1.2), np.deg2rad(0.8)])  # side, lift, yaw, pitch, roll
 
@@ -61,146 +58,20 @@ class Kind:
     leaves_route: bool = False
 
 
-def _overlap_m(route: Route) -> float:
-    """Return how far a lap goes on after it has closed."""
-    length = float(np.linalg.norm(np.diff(route.waypoints, axis=0, append=route.waypoints[:1]), axis=1).sum())
-    return max(4.0, 0.06 * length)
-
-
-def _once(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    return [course.drive(course.lap(route), limits)]
-
-
-def _loop(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    _require_closed(route, "loop")
-    return [course.drive(course.lap(route, _overlap_m(route)), limits)]
-
-
-def _round(route: Route, limits: Limits, rng: np.random.Generator) -> list[Array]:
-    return (_loop if route.closed else _once)(route, limits, rng)
-
-
-def _figure_eight(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    """The second half of the corners in reverse order: the way crosses itself in the middle."""
-    _require_closed(route, "figure_eight")
-    half = (len(route.waypoints) + 1) // 2
-    corners = _inside(route, EIGHT_INSIDE)
-    crossed = np.concatenate([corners[:half], corners[half:][::-1]])
-    eight = Route(route.name, crossed, True, route.corner_radius_m, route.speed_m_s)
-    return [course.drive(course.lap(eight, _overlap_m(eight)), limits)]
-
-
-def _there_and_back(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    """To the end of an open route, half round a closed one."""
-    path = course.part(course.lap(route), 0, 0.5 if route.closed else 1)
-    there = course.drive(path, limits)
-    around = course.turn(there, np.pi, limits)
-    return [course.joined([there, around, course.drive(path[::-1], limits)])]
-
-
-def _lawn_mower(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    """Lanes across the area that a closed route encloses; along an open route, lanes side by side."""
-    if not route.closed:
-        path = course.lap(route)
-        pieces = [course.drive(course.aside(path, -0.6 * route.clearance_m), limits)]
-        for lane, offset in enumerate((0.0, 0.6 * route.clearance_m)):
-            way = course.aside(path, offset)
-            pieces.append(course.turn(pieces[-1], np.pi, limits))
-            pieces.append(course.drive(way if lane % 2 else way[::-1], limits))
-        return [_bridged(pieces, limits)]
-    area = _inside(route, MOWER_INSIDE)
-    low, high = area.min(axis=0), area.max(axis=0)
-    across = int(np.argmin((high - low)[:2]))
-    lanes = round(float((high - low)[across]) / max(0.8, 2 * route.clearance_m)) + 1
-    count = min(MOST_LANES, max(3, lanes))
-    corners = []
-    for lane, at in enumerate(np.linspace(low[across], high[across], count)):
-        for end in (low, high) if lane % 2 == 0 else (high, low):
-            corner = np.array([end[0], end[1], route.waypoints[0, 2]])
-            corner[across] = at
-            corners.append(corner)
-    radius = min(route.corner_radius_m, 0.4 * float((high - low)[across]) / (count - 1))
-    mower = Route(route.name, np.stack(corners), False, radius, route.speed_m_s)
-    return [course.drive(course.lap(mower), limits)]
-
-
-def _inside(route: Route, share: float) -> Array:
-    """Return the corners (N, 3) of a closed route drawn together about their middle, at their height."""
-    middle = route.waypoints.mean(axis=0)
-    return np.asarray(middle + np.array([share, share, 1.0]) * (route.waypoints - middle))
-
-
-def _bridged(pieces: list[Array], limits: Limits) -> Array:
-    """Return the pieces joined, with short drives sideways wherever one begins beside the end of the last."""
-    out = [pieces[0]]
-    for piece in pieces[1:]:
-        gap = np.linalg.norm(piece[0, :3] - out[-1][-1, :3])
-        if gap > 1e-6:
-            f = np.linspace(0, 1, max(8, int(1.875 * gap / (0.3 * limits.speed_m_s) / TICK_S)))[:, None]
-            shift = np.repeat(out[-1][-1:], len(f), axis=0)
-            shift[:, :3] += (10 * f**3 - 15 * f**4 + 6 * f**5) * (piece[0, :3] - out[-1][-1, :3])
-            out.append(shift)
-        out.append(piece)
-    return course.joined(out)
-
-
-def _stop_and_go(route: Route, limits: Limits, rng: np.random.Generator) -> list[Array]:
-    path = course.lap(route, _overlap_m(route))
-    stops = np.concatenate([[0], np.arange(1, 6) / 6 + rng.uniform(-0.05, 0.05, 5), [1]])
-    pieces: list[Array] = []
-    for start, end in itertools.pairwise(stops.tolist()):
-        pieces.append(course.drive(course.part(path, start, end), limits))
-        pieces.append(course.pause(pieces[-1], rng.uniform(1.0, 2.5)))
-    return [course.joined(pieces)]
-
-
-def _pure_rotation(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    """Drive so that a map can begin, turn once round about the optical centre, drive on, turn once round back."""
-    path = course.lap(route)
-    pieces = [course.drive(course.part(path, 0, 0.2), limits)]
-    for start, end, angle in ((0.2, 0.4, 2 * np.pi), (0.4, 0.5, -2 * np.pi)):
-        pieces.append(course.turn(pieces[-1], angle, limits))
-        pieces.append(course.drive(course.part(path, start, end), limits))
-    return [course.joined(pieces)]
-
-
-def _kidnap(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
-    """Carried ahead to a place not seen yet, then back to one that has been seen; stamps go on."""
-    path = course.lap(route, _overlap_m(route))
-    shares = ((0.0, 0.4), (0.7, 1.0), (0.2, 0.45))
-    return [course.drive(course.part(path, *share), limits) for share in shares]
-
-
-def _second_traversal(route: Route, limits: Limits, rng: np.random.Generator) -> list[Array]:
-    """The same way, up to 0.35 m aside and looking up to 6 degrees aside, changing slowly."""
-    room = min(0.35, 0.6 * route.clearance_m)
-    path = course.lap(route, _overlap_m(route))
-    side = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 0.8) * room
-    piece = course.drive(course.aside(path, side), limits)
-    waves = np.sin(2 * np.pi * np.arange(len(piece)) * TICK_S / rng.uniform(11, 17) + rng.uniform(0, 2 * np.pi))
-    piece[:, 3] += np.deg2rad(rng.choice([-1.0, 1.0]) * rng.uniform(2, 4) + 2 * waves)
-    return [piece]
-
-
-def _require_closed(route: Route, kind: str) -> None:
-    if not route.closed:
-        raise SeamarkError(f"route {route.name} does not come back to its start, so there is no {kind} along it")
-
-
 HAND = Shake(0.012, 0.012, np.deg2rad(1.0), np.deg2rad(0.9), np.deg2rad(0.9), 0.4, 2.2)
 FLIGHT = Shake(0.06, 0.12, np.deg2rad(7), np.deg2rad(6), np.deg2rad(6), 0.05, 0.3)
 KINDS: dict[str, Kind] = {
-    "loop": Kind("once round and a little more", _loop),
-    "once": Kind("from one end to the other", _once),
-    "figure_eight": Kind("a way that crosses itself; needs an open area", _figure_eight, leaves_route=True),
-    "there_and_back": Kind("to the end or half round, about turn, back in the opposite direction", _there_and_back),
-    "lawn_mower": Kind("lanes side by side in alternating directions", _lawn_mower, leaves_route=True),
-    "hand_held": Kind("once round with the jitter of a hand", _round, HAND, 1.3, 4.0, 1.5),
-    "six_dof": Kind("once round, rising, sinking, nodding and rolling", _round, FLIGHT, 1.3, 2.0, 1.2),
-    "stop_and_go": Kind("once round with five stops", _stop_and_go),
-    "pure_rotation": Kind("drive, turn once round on the spot, twice", _pure_rotation),
-    "kidnap": Kind("carried away twice, in no time", _kidnap),
-    "second_traversal": Kind("once round again, aside and looking aside", _second_traversal),
+    "loop": Kind("once round and a little more", ways.loop),
+    "once": Kind("from one end to the other", ways.once),
+    "figure_eight": Kind("a way that crosses itself; needs an open area", ways.figure_eight, leaves_route=True),
+    "there_and_back": Kind("to the end or half round, about turn, back in the opposite direction", ways.there_and_back),
+    "lawn_mower": Kind("lanes side by side in alternating directions", ways.lawn_mower, leaves_route=True),
+    "hand_held": Kind("once round with the jitter of a hand", ways.once_round, HAND, 1.3, 4.0, 1.5),
+    "six_dof": Kind("once round, rising, sinking, nodding and rolling", ways.once_round, FLIGHT, 1.3, 2.0, 1.2),
+    "stop_and_go": Kind("once round with five stops", ways.stop_and_go),
+    "pure_rotation": Kind("drive, turn once round on the spot, twice", ways.pure_rotation),
+    "kidnap": Kind("carried away twice, in no time", ways.kidnap),
+    "second_traversal": Kind("once round again, aside and looking aside", ways.second_traversal),
 }
 
 
