@@ -22,6 +22,7 @@ GRID = (24, 32)  # points of a frame that stand for its surface
 TOLERANCE_M, TOLERANCE_SHARE = 0.05, 0.03  # of depth, for two views of one point
 SCALE_LIMIT = 3.0  # seen this much nearer or farther a surface is not recognised
 SAME_PLACE_SHARE = 0.25
+UNRELATED_SHARE = 0.02
 
 
 def _pixels(camera: Camera) -> Array:
@@ -96,6 +97,13 @@ class PlaceTruth:
     def same_place(self, least_share: float = SAME_PLACE_SHARE) -> NDArray[np.bool_]:
         """Return (N, N) True where two frames share at least that much of what they see."""
         return np.asarray(self.overlap >= least_share)
+
+    def unrelated(self, most_share: float = UNRELATED_SHARE) -> NDArray[np.bool_]:
+        """Return (N, N) True where neither frame sees more than that of what the other sees: a match there is false.
+
+        Between the two lie pairs that may be matched and need not be.
+        """
+        return np.asarray(np.maximum(self.shares, self.shares.T) <= most_share)
 
 
 def place_truth(depths: Iterable[DepthImage], T_world_cam: Sequence[Array] | Array, camera: Camera) -> PlaceTruth:

@@ -58,7 +58,7 @@ SCENARIOS = _numbered(
         "back_again",
         "loop",
         "trajectory=there_and_back,size=small,frames=420,sensors=rgbd",
-        "every place again in the opposite direction: no loop until home",
+        "every place again in the opposite direction: little surface is shared",
     ),
     (
         "stop_and_go",

@@ -109,6 +109,10 @@ def test_place_truth_is_not_distance(world: ToyWorld) -> None:
     same = truth.same_place()
     assert np.array_equal(same, same.T)
     assert same[0, 1] and not same[0, 2]
+    unrelated = truth.unrelated()
+    assert np.array_equal(unrelated, unrelated.T)
+    assert unrelated[0, 2] and not unrelated[0, 1]
+    assert not np.any(same & unrelated)
 
 
 def test_place_truth_finds_the_end_of_a_loop(world: ToyWorld) -> None:
