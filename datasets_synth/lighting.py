@@ -12,19 +12,23 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Illumination:
-    """Factors (RGB) on the ambient light, the sun, the lamps, and what glows with daylight: sky and windows."""
+    """Factors (RGB) on the ambient light, the sun, the lamps, and what glows with daylight: sky and windows.
+
+    ``odd_lamps`` is a further factor on lamps with odd numbers, most of which are off at night.
+    """
 
     ambient: Colour = (1.0, 1.0, 1.0)
     sun: Colour = (1.0, 1.0, 1.0)
     lamps: Colour = (1.0, 1.0, 1.0)
     sky: Colour = (1.0, 1.0, 1.0)
+    odd_lamps: Colour = (1.0, 1.0, 1.0)
 
 
 DAY = Illumination()
 INDOORS = {
     "day": DAY,
     "dusk": Illumination((0.38, 0.34, 0.32), (0, 0, 0), (0.9, 0.72, 0.5), (0.42, 0.30, 0.26)),
-    "night": Illumination((0.10, 0.10, 0.12), (0, 0, 0), (0.75, 0.5, 0.27), (0.012, 0.014, 0.025)),
+    "night": Illumination((0.06, 0.06, 0.075), (0, 0, 0), (0.6, 0.4, 0.2), (0.012, 0.014, 0.025), (0.04, 0.04, 0.04)),
 }
 OUTDOORS = {
     "day": Illumination(lamps=(0, 0, 0)),
@@ -64,6 +68,5 @@ def illumination(condition: str, outdoors: bool, share: float) -> Illumination:
         light = _blend(table["dusk"], table["night"], 0.5 * (share - dusk) / (end - dusk))
     cloud = 1 - CLOUD_DEPTH * float(0.5 - 0.5 * np.cos(2 * np.pi * CLOUDS * share))
     lamps = 0.1 if SWITCHED_OFF[0] <= share < SWITCHED_OFF[1] else 1.0
-    return Illumination(
-        _scaled(light.ambient, 0.5 + 0.5 * cloud), _scaled(light.sun, cloud), _scaled(light.lamps, lamps), light.sky
-    )
+    ambient, sun = _scaled(light.ambient, 0.5 + 0.5 * cloud), _scaled(light.sun, cloud)
+    return Illumination(ambient, sun, _scaled(light.lamps, lamps), light.sky, light.odd_lamps)

@@ -114,7 +114,7 @@ class Renderer:
         self._world = world
         self._scene = sapien.Scene()
         self._scene.set_ambient_light(world.ambient)
-        self._glowing: list[tuple[Any, float, bool]] = []
+        self._glowing: list[tuple[Any, Panel, bool]] = []  # with whether its lamp has an odd number
         self._labels = np.zeros(1, np.uint8)
         for group in _by_picture(world.panels):
             self._add([group], LABEL_SKY if group[0].sky and world.sun is not None else LABEL_STATIC)
@@ -141,8 +141,8 @@ class Renderer:
         for group in groups:
             material = _material(group[0])
             if group[0].glow > 0 or group[0].sky:
-                self._glowing.append((material, group[0].glow, group[0].sky))
-                self._glow(material, group[0].glow, group[0].sky, DAY)
+                self._glowing.append((material, group[0], len(group) == 1 and self._is_odd(group[0])))
+                self._glow(*self._glowing[-1], DAY)
             body.attach(_mesh(group, material))
         entity.add_component(body)
         self._scene.add_entity(entity)
@@ -158,10 +158,22 @@ class Renderer:
         made.set_perspective_parameters(NEAR_M, far, camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, 0.0)
         return made
 
+    def _is_odd(self, panel: Panel) -> bool:
+        """Return whether the lamp nearest to a glowing panel has an odd number."""
+        away = [float(np.linalg.norm(lamp.position - panel.corner)) for lamp in self._world.lamps]
+        return bool(away) and int(np.argmin(away)) % 2 == 1
+
     @staticmethod
-    def _glow(material: Any, glow: float, sky: bool, light: Illumination) -> None:
-        factors = light.sky if sky else [min(1.0, 1.2 * max(light.lamps))] * 3
-        material.emission = [*(glow * factor for factor in factors), 1.0]
+    def _glow(material: Any, panel: Panel, odd: bool, light: Illumination) -> None:
+        factors: Sequence[float] = [min(1.0, 1.2 * max(light.lamps) * (max(light.odd_lamps) if odd else 1.0))] * 3
+        if panel.sky:
+            factors = light.sky
+        material.emission = [*(panel.glow * factor for factor in factors), 1.0]
+
+    def _lamp_colour(self, number: int) -> list[float]:
+        """Return the colour of a lamp in the present light."""
+        odd = self._light.odd_lamps if number % 2 else DAY.odd_lamps
+        return [a * b * c for a, b, c in zip(self._world.lamps[number].colour, self._light.lamps, odd, strict=True)]
 
     def illuminate(self, light: Illumination) -> None:
         """Change the light from now on."""
@@ -173,10 +185,10 @@ class Renderer:
         if self._sun is not None and world.sun is not None:
             self._sun.color = [a * b for a, b in zip(world.sun.colour, light.sun, strict=True)]
         if not world.lamps_at_once:
-            for shown, lamp in zip(self._lamps, world.lamps, strict=True):
-                shown.color = [a * b for a, b in zip(lamp.colour, light.lamps, strict=True)]
-        for material, glow, sky in self._glowing:
-            self._glow(material, glow, sky, light)
+            for number, shown in enumerate(self._lamps):
+                shown.color = self._lamp_colour(number)
+        for material, panel, odd in self._glowing:
+            self._glow(material, panel, odd, light)
 
     def place(self, mover: int, position: Vector | None, yaw: float = 0.0) -> None:
         """Put a mover's origin to ``position`` (3,) m, turned about z; None takes it out of the world."""
@@ -195,8 +207,7 @@ class Renderer:
         for shown, number in zip(self._lamps, order[:count], strict=True):
             fade = min(1.0, (edge - distances[number]) / (0.3 * edge)) if np.isfinite(edge) else 1.0
             shown.entity.set_pose(_at(lamps[number].position))
-            factors = zip(lamps[number].colour, self._light.lamps, strict=True)
-            shown.color = [fade * colour * factor for colour, factor in factors]
+            shown.color = [fade * channel for channel in self._lamp_colour(int(number))]
 
     def meter(self, T_world_cam: se3.Matrix) -> Colour:
         """Return a small picture at an exposure of one, to choose an exposure by; only where ``meter`` was asked."""
