@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from seamark.frontend import flow, se3
 from seamark.frontend.config import FrontendConfig
-from seamark.frontend.epipolar import refine_along
 from seamark.frontend.features import grey_of
+from seamark.frontend.patches import align_along
 from seamark.frontend.types import Frame, Mode, Rig
 
 EPIPOLAR_PX = 1.5
@@ -108,7 +108,7 @@ class StereoPair:
 
         chosen = np.flatnonzero(ok)
         on_curve, along = self._epipolar_curve(points[chosen], inverse[chosen])
-        refined, correlation = refine_along(left, right, points[chosen], on_curve, along)
+        refined, correlation = align_along(left, right, points[chosen], on_curve, along)
         inverse[chosen], distance = self._triangulate(points[chosen], refined)
         stayed = np.linalg.norm(refined - on_curve, axis=1) < MAX_REFINEMENT_PX
         sigma = c.disparity_sigma_px / (self._left.fx * self._baseline_m)

@@ -125,6 +125,11 @@ class Frontend:
         watch.lap("pose")
         if pose is None:
             return self._recover(session, frame, grey)
+        settled = tracker.settle(session, grey, tracks, pose.T_odom_cam)
+        better, keep_better = tracker.estimate(session, self._sensor, frame, settled)
+        if better is not None:
+            pose, keep, tracks = better, keep_better, settled
+        watch.lap("settle")
 
         session.move(frame.stamp_ns, pose.T_odom_cam, tracks[keep])
         keyframe_id = None

@@ -4,7 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.frontend import flow, se3
+from seamark.frontend.camera import Camera
 from seamark.frontend.depth import DepthImage, DepthSensor
+from seamark.frontend.patches import align_warped
 from seamark.frontend.pose import PoseEstimate, estimate_pose
 from seamark.frontend.session import Session
 from seamark.frontend.tracks import Tracks
@@ -14,6 +16,11 @@ from seamark.frontend.types import Frame
 GUESS_DEPTH = 1e3  # tracks without a landmark move as if far away: by the rotation only
 RETRY_SURVIVORS = 0.5
 STILL_PX = 1.0
+PATCH_PX = 5.0
+MIN_DEPTH = 1e-3
+MAX_LOG_SCALE = 1.1  # a patch that has grown or shrunk threefold in area is another one
+MIN_CORRELATION = 0.8
+MAX_SETTLING_PX = 1.5
 
 
 def predict_pixels(session: Session, tracks: Tracks) -> NDArray[np.float32]:
@@ -85,6 +92,46 @@ def estimate(
     if pose is not None:
         keep[np.flatnonzero(known)[~pose.inliers]] = False
     return pose, keep
+
+
+def settle(session: Session, grey: NDArray[np.uint8], tracks: Tracks, T_odom_cam: NDArray[np.float64]) -> Tracks:
+    """Align tracks once more with their patches in the newest keyframe, warped as the pose says; undoes their drift."""
+    reference, camera = session.reference, session.camera
+    _, mine, theirs = np.intersect1d(tracks.ids, reference.track_ids, assume_unique=True, return_indices=True)
+    positions = session.landmarks.get(tracks.ids[mine])
+    known = np.isfinite(positions[:, 0])
+    mine, theirs = mine[known], theirs[known]
+    in_reference = se3.transform(se3.inverse(reference.T_odom_cam), positions[known])
+    warps = patch_warps(se3.inverse(T_odom_cam) @ reference.T_odom_cam, in_reference, camera)
+    scale = np.linalg.det(warps)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sound = np.abs(np.log(scale)) < MAX_LOG_SCALE
+    mine, theirs, warps = mine[sound], theirs[sound], warps[sound]
+    there, correlation = align_warped(reference.grey, grey, reference.seen[theirs], tracks.pixels[mine], warps)
+    moved = np.linalg.norm(there - tracks.pixels[mine], axis=1)
+    good = (correlation > MIN_CORRELATION) & (moved < MAX_SETTLING_PX)
+    pixels = tracks.pixels.copy()
+    pixels[mine[good]] = there[good]
+    return Tracks(tracks.ids, pixels)
+
+
+def patch_warps(
+    T_now_reference: NDArray[np.float64], in_reference: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Return how small patches around points (N, 3) of the reference camera, facing it, change: (N, 2, 2), NaN
+    behind.
+    """
+
+    def seen(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        in_now = se3.transform(T_now_reference, points)
+        in_now[(in_now[:, 2] < MIN_DEPTH) | (points[:, 2] < MIN_DEPTH)] = np.nan
+        return camera.project_ideal(in_now)
+
+    centre = seen(in_reference)
+    depth = in_reference[:, 2:]
+    right = seen(in_reference + depth * (PATCH_PX / camera.fx, 0, 0))
+    below = seen(in_reference + depth * (0, PATCH_PX / camera.fy, 0))
+    return np.stack([right - centre, below - centre], axis=2) / PATCH_PX
 
 
 def keyframe_due(session: Session, stamp_ns: int, n_inliers: int) -> bool:
