@@ -127,7 +127,8 @@ def test_a_rendered_world_resumes_at_its_frame(tmp_path: Path, monkeypatch: pyte
 
         def frames(self) -> list[CodedFrame]:
             picture = np.zeros((48, 64, 3), np.uint8)
-            return [CodedFrame(k, code_picture(picture + np.uint8(k))) for k in range(self.begin, 6)]
+            made = range(self.begin, 6)
+            return [CodedFrame(k, code_picture(picture + np.uint8(k)), labels=b"%d" % k) for k in made]
 
     def interrupt(done: int, _: int) -> None:
         if done == 4:
@@ -142,6 +143,7 @@ def test_a_rendered_world_resumes_at_its_frame(tmp_path: Path, monkeypatch: pyte
     assert begins == [0, 4]
     values = [int(cv2.imread(str(tmp_path / "a" / "image_0" / f"{k:06d}.png"))[0, 0, 0]) for k in range(6)]
     assert values == list(range(6))
+    assert (tmp_path / "a" / "labels" / "000003.png").read_bytes() == b"3"
     assert json.loads((tmp_path / "a" / "synth.json").read_text())["synth"].startswith("loop,frames=6,seed=0")
 
 
