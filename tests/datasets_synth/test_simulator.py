@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from seamark.datasets_synth import optics, sensor, specification
-from seamark.datasets_synth.rendering import NoVulkanDevice, RenderPool, require_renderer
+from seamark.datasets_synth import fallback, optics, sensor, specification
+from seamark.datasets_synth.rendering import NoVulkanDevice, RenderPool, render_some, require_renderer
 from seamark.datasets_synth.scenario import open_synth
 from seamark.datasets_synth.sequence import SynthSequence
 from seamark.frontend import se3
@@ -144,3 +144,13 @@ def test_a_distorting_camera_sees_people_and_tells_which_pixels_they_are() -> No
     assert len(errors) > 60
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.5
     assert np.all(np.abs(np.median(errors, axis=0)) < 0.25)
+
+
+def test_the_loop_is_still_the_one_that_is_kept() -> None:
+    wanted, kept = specification.parse(fallback.SPECIFICATION), open_synth("small_loop")
+    assert np.allclose(wanted.poses(), kept.ground_truth.T_world_cam, atol=1e-8)
+    (coded,) = render_some(wanted, [110])
+    now = sensor.decode(coded, 0, "").image.astype(np.float64)
+    then = next(islice(kept.frames(), 110, None)).image
+    assert 0.5 < np.abs(now - then).mean() < 8  # the kept one is coded coarser
+    assert np.abs(now.mean(axis=(0, 1)) - then.mean(axis=(0, 1))).max() < 0.5
