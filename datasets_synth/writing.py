@@ -111,9 +111,9 @@ def write_sequence(
                 if progress is not None:
                     progress(coded.index + 1, total)
             layout.finish(partial, plan.recording())
-            (partial / COUNT).unlink(missing_ok=True)
             (partial / LOCK).unlink()
             partial.rename(target)
+            (target / COUNT).unlink()
     except OSError as error:
         raise SeamarkError(f"{target} cannot be written: {error}") from error
     return Written(target, plan.name, layout_name, total, begin)
@@ -142,7 +142,11 @@ def _staging(target: Path, identity: str) -> Iterator[tuple[Path, int]]:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
             _put(known, identity.encode())
         count = partial / COUNT
-        yield partial, int(count.read_text()) if count.is_file() else 0
+        try:
+            yield partial, int(count.read_text()) if count.is_file() else 0
+        finally:
+            if partial.is_dir() and not count.is_file():  # not one frame was made
+                shutil.rmtree(partial, ignore_errors=True)
 
 
 def _take(lock: IO[str], target: Path) -> None:
