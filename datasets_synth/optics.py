@@ -17,10 +17,11 @@ from seamark.frontend.camera import Camera
 Colour = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-GAMMA = 2.2
+GAMMA = 2.2  # of the renderer's shader
+LEAST_EXPOSURE = 0.25
 GREY = 0.18  # linear light that automatic exposure brings the mean to
 EXPOSURE_LAG = 0.3  # of the way to the wanted exposure (its logarithm) from one frame to the next
-EXPOSURES = (0.25, 12.0)
+EXPOSURES = (LEAST_EXPOSURE, 12.0)
 LONGEST_SHUTTER = 3.0  # times the shutter of an exposure of one; beyond that the gain grows
 BLUR_TAPS = 8
 LEAST_BLUR_PX = 0.7

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.datasets_synth.lighting import DAY, Illumination
+from seamark.datasets_synth.optics import GAMMA, LEAST_EXPOSURE
 from seamark.datasets_synth.panels import Panel, Vector
 from seamark.datasets_synth.world import World
 from seamark.frontend import se3
@@ -132,6 +133,9 @@ class Renderer:
         self._left = self._camera("left", rig.cam0)
         self._right = None if rig.cam1 is None else self._camera("right", rig.cam1)
         self._meter = self._camera("meter", _smaller(rig.cam0)) if meter else None
+        for camera in (self._left, self._right):
+            if meter and camera is not None:
+                camera.set_property("exposure", LEAST_EXPOSURE)
         self._T_left_right = rig.T_cam0_cam1
 
     def _add(self, groups: Sequence[Sequence[Panel]], label: int) -> Any:
@@ -224,27 +228,28 @@ class Renderer:
         self._scene.update_render()
 
     def render(self, T_world_cam: se3.Matrix, *, exposure: float | None = None, labels: bool = False) -> View:
-        """Return what the rig sees from ``T_world_cam``; ``exposure`` is a factor on all light, None for one."""
+        """Return what the rig sees from ``T_world_cam``.
+
+        ``exposure`` is a factor on all light, LEAST_EXPOSURE or more; None for one. It may be given only where a meter
+        was asked for: the cameras then draw at LEAST_EXPOSURE, because changing theirs for every frame leaks memory.
+        """
         if self._right is not None and self._T_left_right is not None:
             self._right.entity.set_pose(_pose(T_world_cam @ self._T_left_right))
-        if exposure is not None:
-            for camera in (self._left, self._right):
-                if camera is not None:
-                    camera.set_property("exposure", float(exposure))
+        gain = 1.0 if exposure is None else (exposure / LEAST_EXPOSURE) ** (1 / GAMMA)
         self._update(T_world_cam, [self._left])
         self._left.take_picture()
         depth = np.maximum(-self._left.get_picture("Position")[..., 2], 0)
-        left = self._colour(self._left)
+        left = self._colour(self._left, gain)
         marked = self._labels[self._left.get_picture("Segmentation")[..., 1]] if labels else None
         if self._right is None:
             return View(left, depth, None, marked)
         self._right.take_picture()
-        return View(left, depth, self._colour(self._right), marked)
+        return View(left, depth, self._colour(self._right, gain), marked)
 
     @staticmethod
-    def _colour(camera: Any) -> Colour:
-        colour: Colour = np.asarray(camera.get_picture("Color")[..., 2::-1] * np.float32(255), np.float32)
-        return colour
+    def _colour(camera: Any, gain: float = 1.0) -> Colour:
+        colour: Colour = np.asarray(camera.get_picture("Color")[..., 2::-1] * np.float32(255 * gain), np.float32)
+        return colour if gain == 1 else np.minimum(colour, np.float32(255))
 
 
 def _at(position: Vector) -> Any:
