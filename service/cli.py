@@ -1,6 +1,5 @@
 """The command line: arguments in, one typed call, a table or JSON out."""
 
-import json
 import os
 import signal
 import sys
@@ -8,17 +7,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from seamark import SeamarkError, __version__
+from seamark.service.terminal import Bar, errors, print_json, print_table
 
 # Everything else is imported in the command that needs it: --help must not wait for GTSAM, faiss and rerun.
 
 EXIT_ERROR = 1
 EXIT_INTERRUPTED = 130
-TABLE_WIDTH = 140
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 app = typer.Typer(
@@ -34,7 +30,6 @@ synth_app = typer.Typer(no_args_is_help=True, help="Synthetic worlds with ground
 app.add_typer(vocab_app, name="vocab")
 app.add_typer(config_app, name="config")
 app.add_typer(synth_app, name="synth")
-errors = Console(stderr=True, highlight=False)
 
 Sources = Annotated[list[str], typer.Argument(help="Folders, videos or synth:NAME, taken one after another.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
@@ -57,48 +52,6 @@ def _config(path: Path | None, overrides: list[str] | None, seed: int | None) ->
 
     extra = [] if seed is None else [f"seed={seed}"]
     return load_config(path, os.environ, [*(overrides or []), *extra])
-
-
-def _print_table(table: Table) -> None:
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=TABLE_WIDTH)  # a pipe has no width that a column should bow to
-    console.print(table)
-
-
-def _print_json(value: object) -> None:
-    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
-
-
-class _Bar:
-    """A progress bar over frames, on standard error and only on a terminal."""
-
-    def __init__(self, title: str) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[state]}"),
-            console=errors,
-            disable=not errors.is_terminal,
-        )
-        self._task = self._progress.add_task(title, total=None, state="")
-
-    def __enter__(self) -> "_Bar":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, done: int, total: int | None, odometry: Any) -> None:
-        self._progress.update(self._task, completed=done, total=total, state=str(odometry.outcome))
-
-    def count(self, done: int, total: int) -> None:
-        """Show how many frames are done."""
-        self._progress.update(self._task, completed=done, total=total)
 
 
 @app.callback(invoke_without_command=True)
@@ -132,13 +85,13 @@ def run_command(
     settings = _config(config, override, seed)
     source = open_sources(sources, mode=mode, calib=calib, fps=fps)
     options = RunOptions(out, tuple(sources), vocab, not no_loops, in_process, realtime)
-    with _Bar(source.name) as bar:
+    with Bar(source.name) as bar:
         record = run(source, options, settings, bar)
     report = build_report(record, for_mode(settings, record.mode))
     if as_json:
-        _print_json(report)
+        print_json(report)
     else:
-        _print_table(report_table(report))
+        print_table(report_table(report))
         sys.stdout.write(f"results: {out}\n")
 
 
@@ -149,15 +102,15 @@ def demo_command(out: OutFolder = Path("demo"), as_json: JsonOption = False, ove
     from seamark.service.report import build_report, report_table
 
     settings = _config(None, override, None)
-    with _Bar("demo") as bar:
+    with Bar("demo") as bar:
         shown = demonstrate(out, settings, bar)
     report = build_report(shown.record, settings)
     if as_json:
-        _print_json(report)
+        print_json(report)
         return
     if shown.notice:
         sys.stdout.write(shown.notice + "\n")
-    _print_table(report_table(report))
+    print_table(report_table(report))
     for what, name in (("picture", shown.picture.name), ("recording", "run.rrd"), ("report", "report.json")):
         sys.stdout.write(f"{what + ':':<11}{out / name}\n")
     sys.stdout.write(f"look at it: {Path(sys.executable).parent / 'rerun'} {out / 'run.rrd'}\n")
@@ -206,10 +159,10 @@ def feed_command(
 
     source = open_sources(sources, mode=mode, calib=calib, fps=fps)
     window = _config(None, None, None).service.frame_window
-    with _Bar(source.name) as bar:
+    with Bar(source.name) as bar:
         outcomes = feed(source, endpoint=connect, namespace=namespace, window=window, realtime=realtime, progress=bar)
     if as_json:
-        _print_json(outcomes)
+        print_json(outcomes)
     else:
         sys.stdout.write(", ".join(f"{count} {outcome}" for outcome, count in sorted(outcomes.items())) + "\n")
 
@@ -228,9 +181,9 @@ def query_command(
 
     reply = query.ask(image, endpoint=connect, namespace=namespace, top_k=top, timeout_s=timeout)
     if as_json:
-        _print_json(query.as_json(reply))
+        print_json(query.as_json(reply))
     elif reply.error_code is None:
-        _print_table(query.table(reply))
+        print_table(query.table(reply))
     if reply.error_code is not None:
         raise query.QueryError(f"{reply.error_code}: {reply.error_message}")
 
@@ -247,9 +200,9 @@ def eval_command(
 
     result = evaluation_report.evaluate_files(trajectory, ground_truth, align)
     if as_json:
-        _print_json(result)
+        print_json(result)
     else:
-        _print_table(evaluation_report.table(result))
+        print_table(evaluation_report.table(result))
 
 
 @vocab_app.command("train")
@@ -278,7 +231,7 @@ def vocab_train_command(
             progress=lambda stage, count: status.update(f"{stage} ({count})"),
         )
     if as_json:
-        _print_json({"file": str(out), "words": vocabulary.n_words, "hash": vocabulary.hash})
+        print_json({"file": str(out), "words": vocabulary.n_words, "hash": vocabulary.hash})
     else:
         sys.stdout.write(f"{out}: {vocabulary.n_words} words, hash {vocabulary.hash[:16]}\n")
 
@@ -290,10 +243,10 @@ def synth_list_command(as_json: JsonOption = False) -> None:
 
     content = synth.catalogue()
     if as_json:
-        _print_json(content)
+        print_json(content)
         return
     for table in synth.tables(content):
-        _print_table(table)
+        print_table(table)
 
 
 @synth_app.command("render")
@@ -312,10 +265,10 @@ def synth_render_command(
     from seamark.service import synth
 
     options = synth.RenderOptions(world, trajectory, sensors, condition, seed, frames)
-    with _Bar(f"synth {world}") as bar:
+    with Bar(f"synth {world}") as bar:
         written = synth.render(options, layout, out, bar.count)
     if as_json:
-        _print_json(written)
+        print_json(written)
     else:
         again = f", {written['resumed']} of them from before" if written["resumed"] else ""
         sys.stdout.write(f"{out}: {written['frames']} frames of {written['synth']} in layout {layout}{again}\n")
@@ -330,7 +283,7 @@ def config_show_command(
 
     resolved = _config(config, override, None)
     if as_json:
-        _print_json(resolved.model_dump(mode="json"))
+        print_json(resolved.model_dump(mode="json"))
     else:
         sys.stdout.write(dump_yaml(resolved))
 
