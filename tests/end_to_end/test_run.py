@@ -56,8 +56,8 @@ def test_rgbd_over_processes_closes_its_loop(toy_tum: Path, n_frames: int, tmp_p
     odometry, corrected = (report["accuracy"][key]["ate"] for key in ("odometry", "corrected"))
     assert corrected["alignment"] == "se3"
     assert 15 < corrected["length_m"] < 18
-    assert 0.001 < corrected["translation_m"]["rmse"] < 0.08
-    assert corrected["translation_m"]["rmse"] < 1.2 * odometry["translation_m"]["rmse"]
+    assert 0.001 < corrected["translation_m"]["rmse"] < 0.03
+    assert corrected["translation_m"]["rmse"] < 0.9 * odometry["translation_m"]["rmse"]
     assert {process["name"] for process in report["processes"]} == {"frontend", "vocab", "backend", "runner"}
 
     frames = rows(out / "frames.csv")
