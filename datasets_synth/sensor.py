@@ -6,13 +6,15 @@ triangulating sensor.
 """
 
 from dataclasses import dataclass
+from functools import cache
+from statistics import NormalDist
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark import SeamarkError
-from seamark.datasets_synth.textures import Image, to_image
+from seamark.datasets_synth.textures import Image
 from seamark.frontend.types import Frame
 
 DEPTH_FACTOR = 5000.0  # raw units per metre, as in the TUM RGB-D sets
@@ -22,6 +24,7 @@ DEPTH_NOISE_CELL_PX = 4
 DISTORTION_CELLS = (4, 5)
 DISTORTION_AT_M = 4.0
 JPEG_QUALITY = 95
+QUANTILES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -59,13 +62,23 @@ class CodedFrame:
     labels: bytes = b""
 
 
+@cache
+def _quantiles() -> NDArray[np.float32]:
+    """Return the middles of QUANTILES equally likely parts of a normal distribution: to draw from, six times as fast."""
+    normal = NormalDist()
+    table = np.array([normal.inv_cdf((part + 0.5) / QUANTILES) for part in range(QUANTILES)], np.float32)
+    table.setflags(write=False)
+    return table
+
+
 def expose(colour: NDArray[np.float32], model: SensorModel, rng: np.random.Generator, gain: float = 1.0) -> Image:
     """Return what the sensor reads of BGR light (H, W, 3) in 0..255: uint8 with noise.
 
     Noise is that of photons: at the same brightness of the picture it grows with the square root of the gain.
     """
-    deviation = np.float32(model.image_noise_grey * float(np.sqrt(gain)))
-    return to_image(colour + deviation * rng.standard_normal(colour.shape, np.float32))
+    deviation = model.image_noise_grey * float(np.sqrt(gain))
+    noise = np.take(_quantiles(), rng.integers(0, QUANTILES, colour.shape, np.uint16))
+    return np.asarray(cv2.addWeighted(noise, deviation, colour, 1.0, 0.0, dtype=cv2.CV_8U), np.uint8)
 
 
 def measure_depth(
@@ -94,7 +107,7 @@ def code_picture(image: Image) -> bytes:
 
 def code_depth(raw: NDArray[np.uint16]) -> bytes:
     """Return raw depth as 16 bit PNG, coded fast rather than small."""
-    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
     return bytes(cv2.imencode(".png", raw, fast)[1])
 
 

@@ -173,7 +173,8 @@ def content_hash(specification: Specification) -> str:
         simulator = "none"
     digest = hashlib.sha256(json.dumps(asdict(specification), sort_keys=True).encode())
     digest.update(f"sapien {simulator} numpy {np.__version__} cv2 {cv2.__version__}".encode())
-    for file in sorted(Path(__file__).parent.glob("*.py")):
+    here = Path(__file__).parent
+    for file in (*sorted(here.glob("*.py")), *sorted(here.glob("shaders/*"))):
         if file.stem not in CHANGE_NO_PICTURE:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

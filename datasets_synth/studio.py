@@ -41,8 +41,7 @@ class Studio:
         wanted, model = self._specification, self._model
         exposure = self._expose(index)
         self._set(index)
-        factor = exposure.factor if self._camera.automatic else None
-        view = self._renderer.render(self._poses[index], exposure=factor, labels=wanted.labels > 0)
+        view = self._renderer.render(self._poses[index], exposure=exposure.factor, labels=wanted.labels > 0)
         left, right = self._photograph(view, index, exposure)
         rng = np.random.default_rng([wanted.motion_seed, index, 0x5E])
         left_file = sensor.code_picture(sensor.expose(left, model, rng, exposure.gain))
