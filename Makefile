@@ -3,15 +3,23 @@ SHELL := /bin/bash
 PYTHON ?= python3.11
 VENV := .venv
 STAMP := $(VENV)/.seamark-installed
+NATIVE_STAMP := $(VENV)/.seamark-native
 
 .PHONY: setup demo test check lint types contracts lock messages clean
-setup: $(STAMP)
+setup: $(NATIVE_STAMP)
 
 $(STAMP): requirements.lock pyproject.toml docker/apt.sh
 	bash docker/apt.sh
 	$(PYTHON) -m venv --upgrade-deps $(VENV) || { echo "seamark: Python 3.11 with venv is needed (Debian: apt-get install python3.11-venv)" >&2; exit 1; }
 	$(VENV)/bin/python -m pip install --quiet --no-deps --require-hashes -r requirements.lock
 	$(VENV)/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+# The kernels lie beside their room, where the editable installation finds them.
+$(NATIVE_STAMP): $(STAMP) CMakeLists.txt $(wildcard vocab/native/*)
+	cmake -S . -B build/native -G Ninja --log-level=WARNING -DPython_EXECUTABLE=$(abspath $(VENV))/bin/python
+	cmake --build build/native -- --quiet
+	cmake --install build/native --prefix src >/dev/null
 	touch $@
 
 demo: setup
@@ -42,4 +50,4 @@ messages: setup
 	$(VENV)/bin/python -m grpc_tools.protoc -I service --python_out=service --pyi_out=service service/messages.proto
 
 clean:
-	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist demo vocab/_native*.so .mypy_cache .ruff_cache .pytest_cache

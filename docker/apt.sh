@@ -11,7 +11,7 @@ export DEBIAN_FRONTEND=noninteractive
 
 installed() { dpkg-query -W -f='${Status}\n' "$@" 2>/dev/null | grep -c '^install ok installed$'; }
 
-base=(build-essential cmake ninja-build python3.11-venv libvulkan1 libgl1 libegl1 libx11-6 libxext6)
+base=(build-essential cmake ninja-build python3.11-dev python3.11-venv libvulkan1 libgl1 libegl1 libx11-6 libxext6)
 if [ "$(installed "${base[@]}" || true)" != "${#base[@]}" ]; then
     apt-get update -qq
     apt-get install -y -qq --no-install-recommends "${base[@]}" >/dev/null

@@ -106,6 +106,8 @@ def test_sdist_and_wheel_hold_every_room(tmp_path: Path) -> None:
     own = next(p for p in sys.path if p.endswith("site-packages"))
     code = "import sys; sys.path.append(sys.argv[1])\n" + "\n".join(f"import seamark.{room}" for room in ROOMS)
     code += "\nfrom seamark.vocab.vocabulary import Vocabulary; assert Vocabulary.default().n_words >= 1000"
+    code += "\nfrom seamark.vocab.kernels import native; assert 'baseline' in native.levels()"
+    code += f"\nassert native.__file__.startswith({str(site)!r})"
     code += "\nfrom seamark.datasets_synth.fallback import small_loop_path; assert small_loop_path().is_dir()"
     code += "\nprint(seamark.__file__)"
     python = tmp_path / "clean" / "bin" / "python"

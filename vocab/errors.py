@@ -3,6 +3,10 @@
 from seamark import SeamarkError
 
 
+class KernelsMissingError(SeamarkError):
+    """An installation without the compiled kernels."""
+
+
 class VocabularyFileError(SeamarkError):
     """A vocabulary file that is missing, damaged, or of a version this program does not read."""
 

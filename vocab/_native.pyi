@@ -1,0 +1,68 @@
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Block: TypeAlias = tuple[
+    int,
+    NDArray[np.uint32],
+    NDArray[np.uint16],
+    NDArray[np.uint8],
+    NDArray[np.uint64] | None,
+    NDArray[np.uint16] | None,
+]
+
+def levels() -> list[str]: ...
+def top(scores: NDArray[np.float32], k: int) -> NDArray[np.int32]: ...
+
+class Quantiser:
+    def __init__(
+        self,
+        words: NDArray[np.uint8],
+        coarse: NDArray[np.uint8],
+        offsets: NDArray[np.int64],
+        level: str | None = None,
+    ) -> None: ...
+    @property
+    def level(self) -> str: ...
+    def assign(
+        self, descriptors: NDArray[np.uint8], k: int = 1, beam: int = 1
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]: ...
+
+class Postings:
+    def __init__(
+        self,
+        n_words: int,
+        code_weights: NDArray[np.float32],
+        block_places: int = 65536,
+        with_signatures: bool = False,
+        with_geometry: bool = False,
+        level: str | None = None,
+    ) -> None: ...
+    def add(
+        self,
+        words: NDArray[np.int32],
+        codes: NDArray[np.uint8],
+        scale: float,
+        signatures: NDArray[np.uint64] | None = None,
+        geometry: NDArray[np.uint16] | None = None,
+    ) -> int: ...
+    def remove(self, slot: int) -> bool: ...
+    def compact(self) -> NDArray[np.int32]: ...
+    def votes(self, words: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]: ...
+    def near_votes(
+        self,
+        words: NDArray[np.int32],
+        weights: NDArray[np.float32],
+        signatures: NDArray[np.uint64],
+        table: NDArray[np.float32],
+        geometry: NDArray[np.uint16] | None = None,
+    ) -> NDArray[np.float32]: ...
+    def snapshot(self) -> tuple[list[_Block], NDArray[np.float32], NDArray[np.uint8]]: ...
+    def attach(self, blocks: list[_Block], scales: NDArray[np.float32], live: NDArray[np.uint8]) -> None: ...
+    @property
+    def n_slots(self) -> int: ...
+    @property
+    def n_live(self) -> int: ...
+    @property
+    def n_bytes(self) -> int: ...

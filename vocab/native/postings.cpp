@@ -1,0 +1,306 @@
+#include "postings.hpp"
+
+#include <algorithm>
+#include <cstdlib>
+#include <new>
+#include <numeric>
+
+namespace seamark {
+namespace {
+
+constexpr int64_t kAhead = 6;         // words between the prefetch of a list and its use
+constexpr int64_t kHeadersAhead = 16;
+
+struct Sealed {
+    const Block& block;
+    int64_t n_words;
+
+    ListView list(int64_t l) const {
+        const uint32_t start = block.starts[l];
+        return {block.ids + start, l >= n_words ? block.codes + (start - block.starts[n_words]) : nullptr,
+                block.signatures ? block.signatures + start : nullptr,
+                block.geometry ? block.geometry + start : nullptr, block.starts[l + 1] - start};
+    }
+    void prefetch_header(int64_t l) const { __builtin_prefetch(block.starts + l); }
+    void prefetch(int64_t l) const {
+        const auto* ids = reinterpret_cast<const char*>(block.ids + block.starts[l]);
+        const auto* signatures = reinterpret_cast<const char*>(block.signatures + block.starts[l]);
+        for (int line = 0; line < 4; ++line) __builtin_prefetch(ids + 64 * line);
+        if (block.signatures)
+            for (int line = 0; line < 4; ++line) __builtin_prefetch(signatures + 64 * line);
+    }
+};
+
+}  // namespace
+
+Block own(std::shared_ptr<BlockArrays> arrays, int64_t n_places) {
+    Block block{n_places, arrays->starts.data(), arrays->ids.data(), arrays->codes.data(), nullptr, nullptr, arrays};
+    if (!arrays->signatures.empty()) block.signatures = arrays->signatures.data();
+    if (!arrays->geometry.empty()) block.geometry = arrays->geometry.data();
+    return block;
+}
+
+Postings::Postings(int64_t n_words, int64_t block_places, bool with_signatures, bool with_geometry,
+                   const std::array<float, kCodes>& code_weights, const Kernels& kernels)
+    : n_words_(n_words),
+      block_places_(block_places),
+      with_signatures_(with_signatures),
+      with_geometry_(with_geometry),
+      code_weights_(code_weights),
+      kernels_(kernels),
+      head_(n_words, with_signatures, with_geometry) {}
+
+int64_t Postings::add(const PlaceView& place, float scale) {
+    const std::lock_guard writing(writer_);
+    if (head_.n_places() == block_places_) {
+        Block full = freeze_head();  // readers go on meanwhile
+        const std::unique_lock change(state_);
+        sealed_.push_back(std::move(full));
+        head_.clear();
+    }
+    const std::unique_lock change(state_);
+    if (head_.n_places() == 0 && !sealed_.empty() && sealed_.back().n_places < block_places_) {
+        head_.refill(sealed_.back());  // the last block of a file grows on
+        sealed_.pop_back();
+    }
+    head_.add(place);
+    scales_.push_back(scale);
+    live_.push_back(1);
+    ++n_live_;
+    return static_cast<int64_t>(scales_.size()) - 1;
+}
+
+bool Postings::remove(int64_t slot) {
+    const std::lock_guard writing(writer_);
+    const std::unique_lock change(state_);
+    if (slot < 0 || slot >= static_cast<int64_t>(live_.size()) || !live_[static_cast<size_t>(slot)]) return false;
+    live_[static_cast<size_t>(slot)] = 0;
+    scales_[static_cast<size_t>(slot)] = 0;
+    --n_live_;
+    return true;
+}
+
+std::vector<int32_t> Postings::compact() {
+    const std::lock_guard writing(writer_);
+    std::vector<int32_t> kept, rank(live_.size(), -1);
+    std::vector<float> scales;
+    for (size_t slot = 0; slot < live_.size(); ++slot) {
+        if (!live_[slot]) continue;
+        rank[slot] = static_cast<int32_t>(kept.size());
+        kept.push_back(static_cast<int32_t>(slot));
+        scales.push_back(scales_[slot]);
+    }
+    std::vector<Block> from = sealed_, fresh;
+    if (head_.n_places()) from.push_back(freeze_head());
+    const auto n = static_cast<int64_t>(kept.size());
+    for (int64_t first = 0; first < n; first += block_places_)
+        fresh.push_back(gather(first, std::min(block_places_, n - first), rank, from));
+    const std::unique_lock change(state_);
+    sealed_ = std::move(fresh);
+    head_.clear();
+    scales_ = std::move(scales);
+    live_.assign(kept.size(), 1);
+    return kept;
+}
+
+Block Postings::gather(int64_t first, int64_t n, const std::vector<int32_t>& rank,
+                       const std::vector<Block>& from) const {
+    auto arrays = std::make_shared<BlockArrays>();
+    arrays->starts.push_back(0);
+    for (int64_t l = 0; l < 2 * n_words_; ++l) {
+        int64_t base = 0;
+        for (const Block& block : from) {
+            const ListView list = Sealed{block, n_words_}.list(l);
+            for (int64_t i = 0; i < list.n; ++i) {
+                const int64_t id = rank[static_cast<size_t>(base + list.ids[i])] - first;
+                if (id < 0 || id >= n) continue;  // removed, or in another of the new blocks
+                arrays->ids.push_back(static_cast<uint16_t>(id));
+                if (list.codes) arrays->codes.push_back(list.codes[i]);
+                if (list.signatures) arrays->signatures.push_back(list.signatures[i]);
+                if (list.geometry) arrays->geometry.push_back(list.geometry[i]);
+            }
+            base += block.n_places;
+        }
+        arrays->starts.push_back(static_cast<uint32_t>(arrays->ids.size()));
+    }
+    return own(std::move(arrays), n);
+}
+
+Block Postings::freeze_head() const {
+    auto arrays = std::make_shared<BlockArrays>();
+    arrays->starts.reserve(static_cast<size_t>(2 * n_words_ + 1));
+    arrays->starts.push_back(0);
+    uint32_t total = 0;
+    for (int64_t l = 0; l < 2 * n_words_; ++l)
+        arrays->starts.push_back(total += static_cast<uint32_t>(head_.list(l).n));
+    arrays->ids.reserve(total);
+    if (with_signatures_) arrays->signatures.reserve(total);
+    if (with_geometry_) arrays->geometry.reserve(total);
+    for (int64_t l = 0; l < 2 * n_words_; ++l) {
+        const ListView list = head_.list(l);
+        arrays->ids.insert(arrays->ids.end(), list.ids, list.ids + list.n);
+        if (list.codes) arrays->codes.insert(arrays->codes.end(), list.codes, list.codes + list.n);
+        if (list.signatures)
+            arrays->signatures.insert(arrays->signatures.end(), list.signatures, list.signatures + list.n);
+        if (list.geometry) arrays->geometry.insert(arrays->geometry.end(), list.geometry, list.geometry + list.n);
+    }
+    return own(std::move(arrays), head_.n_places());
+}
+
+template <class Lists, class Each>
+void Postings::visit(const Lists& lists, const QueryView& query, Each each) const {
+    for (int64_t i = 0; i < query.n; ++i) {
+        if (i + kHeadersAhead < query.n) {
+            lists.prefetch_header(query.words[i + kHeadersAhead]);
+            lists.prefetch_header(query.words[i + kHeadersAhead] + n_words_);
+        }
+        if (i + kAhead < query.n) {
+            lists.prefetch(query.words[i + kAhead]);
+            lists.prefetch(query.words[i + kAhead] + n_words_);
+        }
+        each(i, lists.list(query.words[i]));
+        each(i, lists.list(query.words[i] + n_words_));
+    }
+}
+
+template <class Each>
+void Postings::visit_blocks(const QueryView& query, Each each) const {
+    int64_t first = 0;
+    for (const Block& block : sealed_) {
+        visit(Sealed{block, n_words_}, query, [&](int64_t i, const ListView& list) { each(first, i, list); });
+        first += block.n_places;
+    }
+    if (head_.n_places())
+        visit(head_, query, [&](int64_t i, const ListView& list) { each(first, i, list); });
+}
+
+Scores Postings::votes(const QueryView& query) const {
+    const std::shared_lock reading(state_);
+    Scores scores = room(1);
+    visit_blocks(query, [&](int64_t first, int64_t i, const ListView& list) {
+        float* places = scores.values.get() + first;
+        if (!list.codes) {
+            const float weight = query.weights[i] * code_weights_[1];
+            for (int64_t j = 0; j < list.n; ++j) places[list.ids[j]] += weight;
+        } else {
+            for (int64_t j = 0; j < list.n; ++j) places[list.ids[j]] += query.weights[i] * code_weights_[list.codes[j]];
+        }
+    });
+    return finished(std::move(scores));
+}
+
+Scores Postings::near_votes(const QueryView& query, const float* table, int limit, bool geometric) const {
+    constexpr int64_t kBins = kOrientationBins + kScaleBins;
+    constexpr int64_t kPiece = 4096;
+    const std::shared_lock reading(state_);
+    Scores total = room(geometric ? kBins : 1);
+    std::array<uint32_t, kPiece> positions;
+    std::array<uint8_t, kPiece> distances;
+    visit_blocks(query, [&](int64_t first, int64_t i, const ListView& list) {
+        for (int64_t from = 0; from < list.n; from += kPiece) {
+            const int64_t found =
+                kernels_.near_signatures(list.signatures + from, std::min(kPiece, list.n - from), query.signatures[i],
+                                         limit, positions.data(), distances.data());
+            for (int64_t j = 0; j < found; ++j) {
+                const int64_t at = from + positions[static_cast<size_t>(j)];
+                const float weight = query.weights[i] * code_weights_[list.codes ? list.codes[at] : 1] *
+                                     table[distances[static_cast<size_t>(j)]];
+                const int64_t slot = first + list.ids[at];
+                if (!geometric) {
+                    total.values[static_cast<size_t>(slot)] += weight;
+                    continue;
+                }
+                const int there = list.geometry[at], here = query.geometry[i];
+                const int turn = ((there & 255) - (here & 255) + 256 + 8) & 255;  // bins are centred on no turn
+                const int growth = std::clamp(((there >> 8) - (here >> 8) + 8 + 128) >> 4, 0, kScaleBins - 1);
+                float* bins = total.values.get() + slot * kBins;
+                bins[turn >> 4] += weight;
+                bins[kOrientationBins + growth] += weight;
+            }
+        }
+    });
+    if (!geometric) return finished(std::move(total));
+    Scores scores = room(1);
+    for (int64_t slot = 0; slot < scores.n; ++slot) {
+        const float* bins = total.values.get() + slot * kBins;
+        scores.values[static_cast<size_t>(slot)] = std::min(*std::max_element(bins, bins + kOrientationBins),
+                                                            *std::max_element(bins + kOrientationBins, bins + kBins));
+    }
+    return finished(std::move(scores));
+}
+
+Scores Postings::room(int64_t per_slot) const {
+    const size_t n = scales_.size();
+    auto* values = static_cast<float*>(std::calloc((n + kMostPlaces) * static_cast<size_t>(per_slot), sizeof(float)));
+    if (!values) throw std::bad_alloc();
+    return {std::unique_ptr<float[], Scores::Free>(values), static_cast<int64_t>(n)};
+}
+
+Scores Postings::finished(Scores scores) const {
+    float* values = scores.values.get();
+    for (size_t slot = 0; slot < scales_.size(); ++slot) values[slot] *= scales_[slot];
+    return scores;
+}
+
+void Scores::Free::operator()(float* values) const { std::free(values); }
+
+Snapshot Postings::snapshot() const {
+    const std::shared_lock reading(state_);
+    Snapshot now{sealed_, scales_, live_};
+    if (head_.n_places()) now.blocks.push_back(freeze_head());
+    return now;
+}
+
+void Postings::attach(Snapshot snapshot) {
+    const std::lock_guard writing(writer_);
+    const std::unique_lock change(state_);
+    sealed_ = std::move(snapshot.blocks);
+    head_.clear();
+    scales_ = std::move(snapshot.scales);
+    live_ = std::move(snapshot.live);
+    n_live_ = std::count(live_.begin(), live_.end(), uint8_t{1});
+}
+
+int64_t Postings::n_slots() const {
+    const std::shared_lock reading(state_);
+    return static_cast<int64_t>(scales_.size());
+}
+
+int64_t Postings::n_live() const {
+    const std::shared_lock reading(state_);
+    return n_live_;
+}
+
+size_t Postings::bytes() const {
+    const std::shared_lock reading(state_);
+    size_t total = head_.n_places() ? head_.bytes() : 0;
+    for (const Block& block : sealed_) {
+        const size_t n = block.starts[2 * n_words_];
+        total += static_cast<size_t>(2 * n_words_ + 1) * 4 + n * 2 + (n - block.starts[n_words_]);
+        total += (block.signatures ? n * 8 : 0) + (block.geometry ? n * 2 : 0);
+    }
+    return total;
+}
+
+std::vector<int32_t> top(const float* scores, int64_t n, int64_t k) {
+    k = std::min(k, n);
+    const auto better = [scores](int32_t a, int32_t b) {
+        return scores[a] != scores[b] ? scores[a] > scores[b] : a < b;
+    };
+    std::vector<int32_t> best(static_cast<size_t>(k));  // a heap whose front is the worst
+    if (k == 0) return best;
+    std::iota(best.begin(), best.end(), 0);
+    std::make_heap(best.begin(), best.end(), better);
+    float threshold = scores[best.front()];
+    for (int64_t slot = k; slot < n; ++slot) {
+        if (!(scores[slot] > threshold)) continue;
+        std::pop_heap(best.begin(), best.end(), better);
+        best.back() = static_cast<int32_t>(slot);
+        std::push_heap(best.begin(), best.end(), better);
+        threshold = scores[best.front()];
+    }
+    std::sort_heap(best.begin(), best.end(), better);
+    return best;
+}
+
+}  // namespace seamark
