@@ -17,7 +17,7 @@ class Panel:
     ``corner`` (3,) is the top left corner as seen from the front; ``right`` and ``down`` (3,) are its edges in metres.
     The BGR picture covers the whole rectangle; ``glow`` adds light of its own (lamps). What is ``sky`` shines with
     daylight only (the sky, windows seen from inside). ``tiles`` says how often the picture is repeated, mirrored each
-    time, along right and down.
+    time, along right and down. ``gloss`` from 0 to 1 is how much the surface mirrors lamps and the sun.
     """
 
     corner: Vector
@@ -27,6 +27,7 @@ class Panel:
     glow: float = 0.0
     sky: bool = False
     tiles: tuple[float, float] = (1.0, 1.0)
+    gloss: float = 0.0
 
     @property
     def normal(self) -> Vector:
