@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth import sensor, specification
+from seamark.datasets_synth import sensor, specification, world_office
 from seamark.datasets_synth.rendering import render_some
 from seamark.datasets_synth.specification import Specification
 from seamark.datasets_synth.worlds import WORLDS
@@ -131,15 +131,20 @@ def world_row(name: str, images: Path) -> list[str]:
 def alike(
     name: str, poses: NDArray[np.float64], places: list[int], features: dict[int, Features], day: Specification
 ) -> list[float]:
-    """Return the inliers between views that the world repeats on purpose: half a turn in twins."""
-    if name != "twins":
+    """Return the inliers between views that the world repeats on purpose: half a turn in twins, next door in office."""
+    if name == "twins":
+        twin, near = np.diag([-1.0, -1.0, 1.0, 1.0]) @ poses[places], np.abs(poses[places][:, 0, 3]) < 9
+    elif name == "office":
+        twin, near = poses[places].copy(), np.ones(len(places), dtype=bool)
+        twin[:, 0, 3] += np.where(twin[:, 0, 3] > 0, -1, 1) * world_office.PITCH_M
+    else:
         return []
-    turned = np.diag([-1.0, -1.0, 1.0, 1.0]) @ poses[places]
-    twins = nearest(poses, turned)
-    good = [k for k, j in enumerate(twins) if np.linalg.norm(poses[j, :3, 3] - turned[k, :3, 3]) < 0.5]
-    good = [k for k in good if abs(turned[k, 0, 3]) < 9]
-    views = render(day, sorted({twins[k] for k in good}))
-    return [match(features[places[k]], sift(views[twins[k]]))[1] for k in good]
+    alike = nearest(poses, twin)
+    apart = np.linalg.norm(poses[alike][:, :3, 3] - twin[:, :3, 3], axis=1)
+    same_way = np.einsum("nk,nk->n", poses[alike][:, :3, 2], twin[:, :3, 2]) > np.cos(np.deg2rad(15))
+    good = np.flatnonzero(near & (apart < 0.5) & same_way)
+    views = render(day, sorted({alike[k] for k in good}))
+    return [match(features[places[k]], sift(views[alike[k]]))[1] for k in good]
 
 
 def real_rows() -> Iterator[list[str]]:

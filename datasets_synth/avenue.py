@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth import outdoors, prints, textures
+from seamark.datasets_synth import fittings, outdoors, plain, prints, textures
 from seamark.datasets_synth.panels import Panel, Vector, box_faces
 from seamark.datasets_synth.textures import Field, Image, noise, random_colour, tint, to_image
 from seamark.datasets_synth.world import Lamp
@@ -30,17 +30,17 @@ def asphalt(rng: np.random.Generator, length_m: float, width_m: float, *, lane: 
     scale = ROAD_PIXELS_PER_METRE
     height, width = round(width_m * scale), round(length_m * scale)
     colour = np.array([96.0, 95.0, 93.0]) * rng.uniform(0.85, 1.15)
-    relief = 0.13 * noise(rng, height, width, 3.0, 2) + 0.08 * noise(rng, height, width, 90, 4)
+    relief = 0.045 * noise(rng, height, width, 3.0, 2) + 0.06 * noise(rng, height, width, 90, 4)
     canvas = to_image(tint(colour, relief))
-    for _ in range(int(0.35 * length_m * width_m)):
+    for _ in range(int(0.25 * length_m * width_m)):
         place, kind = (rng.uniform(0, 1, 2) * (width, height)).astype(int), int(rng.integers(3))
-        shade = [float(rng.uniform(40, 150))] * 3
+        shade = [float(rng.uniform(62, 122))] * 3
         if kind == 0:
             axes = (int(rng.uniform(3, 40)), int(rng.uniform(3, 20)))
             cv2.ellipse(canvas, place.tolist(), axes, float(rng.uniform(0, 180)), 0, 360, shade, -1, cv2.LINE_AA)
         elif kind == 1:
             path = np.cumsum(rng.normal(0, 7, (25, 2)) + rng.normal(0, 3, 2), axis=0) + place
-            cv2.polylines(canvas, [path.astype(np.int32)], False, (35, 35, 35), 2, cv2.LINE_AA)
+            cv2.polylines(canvas, [path.astype(np.int32)], False, (52, 52, 52), 2, cv2.LINE_AA)
         else:
             end = place + (rng.uniform(0.2, 1.2, 2) * scale).astype(int)
             cv2.rectangle(canvas, place.tolist(), end.tolist(), shade, -1)
@@ -56,19 +56,43 @@ def asphalt(rng: np.random.Generator, length_m: float, width_m: float, *, lane: 
 
 def pavement(rng: np.random.Generator) -> Image:
     """Return slabs of a pavement, 6 m by 2 m."""
-    return prints.add_stickers(rng, textures.tiles(rng, 140, 420, 70.0), 70.0, 2.0)
+    return plain.slabs(rng, 140, 420, 70.0)
 
 
-def _car_side(rng: np.random.Generator) -> Image:
-    """Return the side of a parked car: paint, windows, wheels, a door, a mark."""
-    canvas = to_image(tint(random_colour(rng, 20, 220, 1.2), 0.12 * noise(rng, 110, 300, 60, 3)))
-    cv2.rectangle(canvas, (45, 8), (255, 48), (45, 40, 35), -1)
-    cv2.rectangle(canvas, (145, 8), (155, 100), (30, 30, 30), 2)
+@dataclass(frozen=True, eq=False)
+class CarPaint:
+    """Pictures of a car in one paint: its body from the side and the end, its cabin, and the sheet on top."""
+
+    side: Image
+    end: Image
+    cabin_side: Image
+    cabin_end: Image
+    top: Image
+
+
+def _car_paint(rng: np.random.Generator) -> CarPaint:
+    """Return a car: paint, wheels, a door, lights, a plate with a number; windows that mirror the sky."""
+    colour = random_colour(rng, 30, 190, 0.7)
+    side, end = (to_image(tint(colour, 0.05 * noise(rng, 60, width, 60, 2))) for width in (300, 120))
+    side[48:] = (0.45 * side[48:]).astype(np.uint8)
     for x in (55, 240):
-        cv2.circle(canvas, (x, 92), 22, (20, 20, 20), -1, cv2.LINE_AA)
-        cv2.circle(canvas, (x, 92), 10, (170, 170, 175), -1, cv2.LINE_AA)
-    prints.draw_text(rng, canvas, (80, 52, 130, 20), 18.0)
-    return canvas
+        cv2.circle(side, (x, 46), 26, (18, 18, 18), -1, cv2.LINE_AA)
+        cv2.circle(side, (x, 46), 12, (150, 150, 155), -1, cv2.LINE_AA)
+    for x in (110, 175, 215):
+        cv2.line(side, (x, 2), (x, 46), (0.5 * colour).tolist(), 1, cv2.LINE_AA)
+    cv2.rectangle(side, (160, 12), (170, 15), (40, 40, 40), -1)
+    end[44:] = (0.5 * end[44:]).astype(np.uint8)
+    for x in (8, 92):
+        cv2.rectangle(end, (x, 14), (x + 20, 26), (60, 70, 200) if rng.random() < 0.5 else (210, 215, 215), -1)
+    cv2.rectangle(end, (40, 28), (80, 40), (215, 218, 218), -1)
+    prints.draw_text(rng, end, (42, 26, 36, 14), 12.0)
+    glass = to_image(tint(np.array([110.0, 98.0, 88.0]), np.linspace(0.3, -0.5, 40)[:, None].repeat(160, axis=1)))
+    cabin_side, cabin_end = glass.copy(), glass[:, :100].copy()
+    for image in (cabin_side, cabin_end):
+        cv2.rectangle(image, (0, 0), (image.shape[1] - 1, 39), colour.tolist(), 5)
+    cv2.line(cabin_side, (85, 0), (85, 39), colour.tolist(), 6)
+    top = to_image(tint(colour, 0.04 * noise(rng, 40, 60, 30, 2)))
+    return CarPaint(side, end, cabin_side, cabin_end, top)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +101,25 @@ class Stock:
 
     crowns: tuple[Image, ...]
     bark: Image
-    cars: tuple[Image, ...]
+    cars: tuple[CarPaint, ...]
     walls: tuple[Image, ...]
     metal: Image
     white: Image
+    under: Image
 
 
-def stock(rng: np.random.Generator) -> Stock:
-    """Return pictures drawn from ``rng``."""
+def stock(rng: np.random.Generator, leaves: np.random.Generator) -> Stock:
+    """Return pictures drawn from ``rng``; those of leaves, which no wind leaves alone, from ``leaves``."""
     metal = to_image(tint(np.array([95.0, 100.0, 98.0]), 0.15 * noise(rng, 200, 24, 10, 3)))
+    dark = cv2.GaussianBlur(np.pad(np.full((52, 132), 0.75, np.float32), 14), (0, 0), 7.0)
     return Stock(
-        tuple(outdoors.foliage(rng, 256, 256) for _ in range(5)),
-        textures.wood(rng, 80, 200, 90.0).transpose(1, 0, 2).copy(),
-        tuple(_car_side(rng) for _ in range(6)),
-        tuple(outdoors.facade(rng, 360, 440) for _ in range(4)),
+        tuple(outdoors.foliage(leaves, 256, 256) for _ in range(6)),
+        plain.muted(textures.wood(rng, 80, 200, 90.0).transpose(1, 0, 2), 0.35),
+        tuple(_car_paint(rng) for _ in range(6)),
+        tuple(fittings.front(rng, 540, 440, FRONT_PIXELS_PER_METRE) for _ in range(4)),
         metal,
         np.full((8, 8, 3), 235, np.uint8),
+        to_image(tint(np.array([96.0, 95.0, 93.0]), -dark)),
     )
 
 
@@ -123,31 +150,43 @@ def house(
     faces = box_faces(front - back * depth / 2 + UP * height / 2, np.array([depth, width, height]), facing)
     shape = (round(height * FRONT_PIXELS_PER_METRE), round(width * FRONT_PIXELS_PER_METRE))
     sides = things.walls[int(rng.integers(len(things.walls)))]
-    panels = [Panel(*faces[0], outdoors.facade(rng, *shape))]
+    panels = [Panel(*faces[0], fittings.front(rng, *shape, FRONT_PIXELS_PER_METRE))]
     panels += [Panel(*face, sides) for face in faces[1:4]]
     panels.append(Panel(*faces[4], things.metal))
     return panels
 
 
 def tree(rng: np.random.Generator, things: Stock, foot: Vector) -> list[Panel]:
-    """Return a tree: a trunk, and a crown of boxes turned against each other."""
-    tall, thick = rng.uniform(1.8, 2.8), rng.uniform(0.2, 0.4)
+    """Return a tree: a trunk, and a crown of boxes of many sizes turned against each other."""
+    tall, thick = rng.uniform(2.2, 3.2), rng.uniform(0.2, 0.4)
     panels = [Panel(*face, things.bark) for face in box_faces(foot + UP * tall / 2, np.array([thick, thick, tall]))[:4]]
-    spread, yaw = rng.uniform(1.6, 3.0), rng.uniform(0, np.pi)
-    for number, share in enumerate((1.0, 0.85, 0.6)):
-        size = np.array([spread * share, spread * share, 0.75 * spread])
-        centre = foot + UP * (tall + 0.3 * spread * (2 * number + 0.6))
+    spread = rng.uniform(1.3, 2.2)
+    centre = foot + UP * (tall + 0.75 * spread)
+    for number, share in enumerate((1.25, 0.85, 0.8, 0.75, 0.7, 0.65)):
+        angle = 2.4 * number + rng.uniform(0, 0.6)
+        away = 0.0 if number == 0 else rng.uniform(0.45, 0.7) * spread
+        lift = 0.0 if number == 0 else rng.uniform(-0.45, 0.75) * spread
+        place = centre + np.array([away * np.cos(angle), away * np.sin(angle), lift])
+        size = spread * share * np.array([1.0, 1.0, rng.uniform(0.75, 1.0)])
         crown = things.crowns[int(rng.integers(len(things.crowns)))]
-        panels += [Panel(*face, crown) for face in box_faces(centre, size, yaw + 0.7 * number)]
+        panels += [Panel(*face, crown) for face in box_faces(place, size, float(rng.uniform(0, np.pi)))]
     return panels
 
 
 def car(rng: np.random.Generator, things: Stock, foot: Vector, yaw: float) -> list[Panel]:
-    """Return a parked car."""
-    side = things.cars[int(rng.integers(len(things.cars)))]
-    size = np.array([rng.uniform(3.6, 4.4), 1.7, rng.uniform(1.4, 1.6)])
-    faces = box_faces(foot + UP * (0.12 + size[2] / 2), size, yaw)
-    return [Panel(*face, side) for face in faces[:4]] + [Panel(*faces[4], things.metal)]
+    """Return a parked car: a body, a cabin that shines, and the dark beneath it."""
+    paint = things.cars[int(rng.integers(len(things.cars)))]
+    length, high = rng.uniform(3.8, 4.5), rng.uniform(0.72, 0.85)
+    body = box_faces(foot + UP * (0.15 + high / 2), np.array([length, 1.7, high]), yaw)
+    back = 0.25 * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    cabin = box_faces(foot - back + UP * (0.15 + high + 0.27), np.array([0.52 * length, 1.45, 0.54]), yaw)
+    pictures = (paint.end, paint.side, paint.end, paint.side)
+    panels = [Panel(*face, image, gloss=0.5) for face, image in zip(body, pictures, strict=False)]
+    pictures = (paint.cabin_end, paint.cabin_side, paint.cabin_end, paint.cabin_side)
+    panels += [Panel(*face, image, gloss=0.8) for face, image in zip(cabin, pictures, strict=False)]
+    panels += [Panel(*face, paint.top, gloss=0.5) for face in (body[4], cabin[4])]
+    shadow = box_faces(foot + UP * 0.01, np.array([length + 0.9, 2.5, 0.02]), yaw)[4]
+    return [*panels, Panel(*shadow, things.under)]
 
 
 def street_lamp(things: Stock, foot: Vector, towards: Vector) -> tuple[list[Panel], Lamp]:
@@ -185,11 +224,11 @@ def _round_noise(rng: np.random.Generator, height: int, width: int, cell_px: flo
     return values[:, :width]
 
 
-def _panorama(rng: np.random.Generator, height: int, width: int) -> Image:
+def _panorama(rng: np.random.Generator, clouds: np.random.Generator, height: int, width: int) -> Image:
     """Return the sky all round: clouds that thin out upwards, above far hills."""
     y = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     blue = np.array(ZENITH, np.float32) * (1 - y) + np.array(HORIZON, np.float32) * y
-    cloud = _round_noise(rng, height, width, height / 2, 6)[..., None] * np.clip(4 * y, 0, 1)
+    cloud = _round_noise(clouds, height, width, height / 2, 6)[..., None] * np.clip(4 * y, 0, 1)
     canvas = blue + np.clip(0.8 * cloud, 0, 1) * (np.array([240.0, 240.0, 240.0]) - blue)
     rows = np.arange(height, dtype=np.float32)[:, None]
     for far in (0.80, 0.85, 0.9):
@@ -200,11 +239,11 @@ def _panorama(rng: np.random.Generator, height: int, width: int) -> Image:
     return to_image(canvas)
 
 
-def sky(rng: np.random.Generator, centre: tuple[float, float]) -> list[Panel]:
-    """Return four sides and a top far away, which shine with daylight."""
+def sky(rng: np.random.Generator, clouds: np.random.Generator, centre: tuple[float, float]) -> list[Panel]:
+    """Return four sides and a top far away, which shine with daylight; clouds come from their own generator."""
     x, y = centre
     corners = [np.array([x + SKY_M * a, y + SKY_M * b, 0.8 * SKY_M]) for a, b in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
-    panorama = _panorama(rng, 512, 4096)
+    panorama = _panorama(rng, clouds, 512, 4096)
     panels = []
     for number, side in enumerate(np.split(panorama, 4, axis=1)):
         a, b = corners[number], corners[(number + 1) % 4]

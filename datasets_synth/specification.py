@@ -91,7 +91,7 @@ class Specification:
 
     def build(self) -> World:
         """Return the world."""
-        return WORLDS[self.world].build(self.size, self.seed)
+        return WORLDS[self.world].build(self.size, self.seed, self.run)
 
     def poses(self) -> NDArray[np.float64]:
         """Return T_world_cam (N, 4, 4); raises SeamarkError where the world's route does not allow the trajectory."""

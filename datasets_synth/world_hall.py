@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from seamark.datasets_synth import prints
+from seamark.datasets_synth.clutter import change
 from seamark.datasets_synth.floor_plan import Space
 from seamark.datasets_synth.panels import Panel, box_faces, pixels
 from seamark.datasets_synth.route import Route
@@ -87,26 +88,29 @@ def _post(rng: np.random.Generator, x: float, y: float) -> list[Panel]:
     return panels
 
 
-def _crates(rng: np.random.Generator) -> list[Panel]:
+def _crates(rng: np.random.Generator, seed: int, run: int) -> list[Panel]:
     panels = []
-    for _ in range(CRATES):
+    for number in range(CRATES):
+        became = change(seed, run, number)
         size = rng.uniform((0.7, 0.7, 0.6), (1.3, 1.1, 1.5))
-        x, y = rng.uniform(-12, 12), rng.choice([-8.9, 8.9])
-        for corner, right, down in box_faces(np.array([x, y, size[2] / 2]), size, rng.uniform(-0.5, 0.5)):
-            shape = (pixels(down, 100), pixels(right, 100))
-            panels.append(Panel(corner, right, down, prints.carton(rng, *shape)))
+        x, y = rng.uniform(-12, 12) + became.along_m, rng.choice([-8.9, 8.9])
+        yaw = rng.uniform(-0.5, 0.5) + became.turn_rad
+        for corner, right, down in box_faces(np.array([x, y, size[2] / 2]), size, yaw):
+            image = prints.carton(rng, pixels(down, 100), pixels(right, 100))
+            if became.present:
+                panels.append(Panel(corner, right, down, image))
     return panels
 
 
-def build_hall(_: str, seed: int) -> World:
-    """Return the world."""
+def build_hall(_: str, seed: int, run: int = 0) -> World:
+    """Return the world; ``run`` moves a few crates."""
     rng = np.random.default_rng([seed, 0x4A11])
     across, deep = np.array([SPACE.east - SPACE.west, 0, 0]), np.array([0, SPACE.north - SPACE.south, 0])
     shape = (pixels(deep, FLOOR_PIXELS_PER_METRE), pixels(across, FLOOR_PIXELS_PER_METRE))
     floor = Panel(np.array([SPACE.west, SPACE.north, 0.0]), across, -deep, _concrete(rng, *shape, 5.0))
     above = _concrete(rng, shape[0] // 2, shape[1] // 2, 1.25)
     ceiling = Panel(np.array([SPACE.west, SPACE.south, SPACE.height]), across, deep, above)
-    panels = [*_walls(rng), floor, ceiling, *_crates(rng)]
+    panels = [*_walls(rng), floor, ceiling, *_crates(rng, seed, run)]
     for x, y in POSTS:
         panels += _post(rng, x, y)
     lamps = []

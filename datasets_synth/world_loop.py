@@ -1,11 +1,13 @@
 """The world ``loop``: four rooms at the corners of a ring of four corridors, and one lap through them."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.datasets_synth import floor_plan
+from seamark.datasets_synth.clutter import change
 from seamark.datasets_synth.floor_plan import Space
 from seamark.datasets_synth.route import Route
 from seamark.datasets_synth.walk import STEP_M, rounded, walk
@@ -103,16 +105,17 @@ def loop_route(plan: LoopPlan) -> Route:
     return Route("lap", waypoints, True, plan.rounding_m, 1.6, floor_plan.CLEARANCE_M)
 
 
-def build_loop(plan: LoopPlan, seed: int) -> World:
-    """Return the panels and lamps of the world; everything in it is drawn from ``seed``."""
+def build_loop(plan: LoopPlan, seed: int, run: int = 0) -> World:
+    """Return the panels and lamps of the world, drawn from ``seed``; ``run`` moves a few light things."""
     places, path = spaces(plan), lap(plan)[::10]
     panels, lamps = [], []
     for number, space in enumerate(places):
         rng = np.random.default_rng([seed, number, 0x100F])
         others = [other for other in places if other is not space]
         panels += floor_plan.walls(rng, space, others)
-        panels += floor_plan.floor_and_ceiling(rng, space)
-        panels += floor_plan.furniture(rng, space, path, plan.boxes_per_room)
+        became = partial(change, seed, run, number)
+        boxes, footprints = floor_plan.furniture(rng, space, path, plan.boxes_per_room, became)
+        panels += [*boxes, *floor_plan.floor_and_ceiling(rng, space, others, footprints)]
         glowing, lights = floor_plan.lamps(rng, space)
         panels += glowing
         lamps += lights

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from seamark.datasets_synth import avenue, outdoors
+from seamark.datasets_synth import avenue, outdoors, plain
 from seamark.datasets_synth.avenue import Stock, asphalt, strips
 from seamark.datasets_synth.panels import Panel, Vector, box_faces
 from seamark.datasets_synth.route import Route
+from seamark.datasets_synth.textures import to_image
 from seamark.datasets_synth.world import Lamp, Sun, World
 
 STEP_M = 12.0
@@ -91,13 +92,14 @@ def _roadside(rng: np.random.Generator, things: Stock, points: np.ndarray) -> tu
     return panels, lamps
 
 
-def build_road(_: str, seed: int) -> World:
-    """Return the world."""
+def build_road(_: str, seed: int, run: int = 0) -> World:
+    """Return the world; with ``run`` change leaves and clouds."""
     rng = np.random.default_rng([seed, 0x20AD])
-    things, points = avenue.stock(rng), middle()
+    weather = np.random.default_rng([seed, run, 0x20AE])
+    things, points = avenue.stock(rng, weather), middle()
     surfaces = [asphalt(rng, avenue.STRIP_M, ROAD_M, lane=True) for _ in range(7)]
     low, high = points.min(axis=0) - 120, points.max(axis=0) + 120
-    meadow = outdoors.grass(rng, 1024, 1024)
+    meadow = to_image(plain.muted(outdoors.grass(rng, 1024, 1024), 0.5) * np.array([0.5, 0.85, 0.75]))
     size = high - low
     ground = Panel(
         np.array([low[0], high[1], -0.05]),
@@ -107,7 +109,7 @@ def build_road(_: str, seed: int) -> World:
         tiles=(size[0] / 9, size[1] / 9),
     )
     centre = (low + high) / 2
-    panels = [ground, *avenue.sky(rng, (float(centre[0]), float(centre[1])))]
+    panels = [ground, *avenue.sky(rng, weather, (float(centre[0]), float(centre[1])))]
     panels += strips(points, (-ROAD_M / 2, ROAD_M / 2), 0.0, surfaces)
     more, lamps = _roadside(rng, things, points)
     sun = Sun(np.array([0.3, 0.5, -0.8]), (1.1, 1.05, 0.95))

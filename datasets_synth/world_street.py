@@ -1,9 +1,13 @@
 """The world ``street``: once round a block of houses, with houses across the street, cars, trees and lamps."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from seamark.datasets_synth import avenue
 from seamark.datasets_synth.avenue import Stock, asphalt, pavement, strips
+from seamark.datasets_synth.clutter import Change, change
 from seamark.datasets_synth.panels import Panel
 from seamark.datasets_synth.route import Route
 from seamark.datasets_synth.world import Lamp, Sun, World
@@ -39,7 +43,8 @@ def _row(rng: np.random.Generator, things: Stock, a: np.ndarray, b: np.ndarray, 
     along = (b - a) / length
     out = np.array([along[1], -along[0]]) * (-1 if inward else 1)
     facing = float(np.arctan2(out[1], out[0]))
-    panels, reach = [], 0.0
+    panels, reach = [], 0.05  # so that its end is not in the plane of the next row
+    length -= 0.05
     while reach < length - 0.1:
         width = float(rng.uniform(*HOUSE_M))
         if length - reach - width < HOUSE_M[0]:
@@ -51,9 +56,13 @@ def _row(rng: np.random.Generator, things: Stock, a: np.ndarray, b: np.ndarray, 
 
 
 def _furnish(
-    rng: np.random.Generator, things: Stock, a: np.ndarray, b: np.ndarray, aside: float
+    rng: np.random.Generator, things: Stock, a: np.ndarray, b: np.ndarray, became: Callable[[int], Change]
 ) -> tuple[list[Panel], list[Lamp]]:
-    """Return lamps, trees, signs and parked cars along a side a-b (2,) of the block, on both pavements."""
+    """Return lamps, trees, signs and parked cars along a side a-b (2,) of the block, on both pavements.
+
+    ``became`` says which cars have left or have parked again elsewhere.
+    """
+    aside = STREET_M
     length = float(np.linalg.norm(b - a))
     along = (b - a) / length
     out = np.array([along[1], -along[0]])
@@ -70,25 +79,28 @@ def _furnish(
         more, lamp = avenue.street_lamp(things, at(float(s), 1.7 if near else aside - 1.7), towards)
         panels += more
         lamps.append(lamp)
-    for s in np.arange(3.0, length - 2, 6.5):
+    for s in np.arange(3.0, length - 2, 5.0):
         kind = int(rng.integers(4))
         d = float(rng.choice([1.2, aside - 1.2]))
-        if kind < 2:
+        if kind < 3:
             panels += avenue.tree(rng, things, at(float(s) + rng.uniform(-1, 1), d))
-        elif kind == 2:
+        else:
             panels += avenue.sign(rng, things, at(float(s), d), yaw + np.pi)
-    for s in np.arange(4.0, length - 4, 5.5):
-        if rng.random() < 0.6:
-            panels += avenue.car(rng, things, at(float(s), aside - PAVEMENT_M - 1.0), yaw + rng.normal(0, 0.03))
-        if rng.random() < 0.25:
-            panels += avenue.car(rng, things, at(float(s), PAVEMENT_M + 0.2), yaw + rng.normal(0, 0.02))
+    for number, s in enumerate(np.arange(4.0, length - 4, 5.5)):
+        for kind, (share, d) in enumerate(((0.75, aside - PAVEMENT_M - 1.0), (0.25, PAVEMENT_M + 0.2))):
+            if rng.random() < share:
+                now = became(2 * number + kind)
+                parked = at(float(s) + float(np.clip(now.along_m, -0.4, 0.4)), d)
+                vehicle = avenue.car(rng, things, parked, yaw + rng.normal(0, 0.03) + 0.05 * now.turn_rad)
+                panels += vehicle if now.present else []
     return panels, lamps
 
 
-def build_street(_: str, seed: int) -> World:
-    """Return the world."""
+def build_street(_: str, seed: int, run: int = 0) -> World:
+    """Return the world; with ``run`` change leaves, clouds and some parked cars."""
     rng = np.random.default_rng([seed, 0x57EE])
-    things = avenue.stock(rng)
+    weather = np.random.default_rng([seed, run, 0x57EF])
+    things = avenue.stock(rng, weather)
     road = [asphalt(rng, avenue.STRIP_M, STREET_M - 2 * PAVEMENT_M, lane=True) for _ in range(4)]
     slabs = [pavement(rng) for _ in range(3)]
     ground = asphalt(rng, 16.0, 16.0, lane=False)
@@ -96,12 +108,12 @@ def build_street(_: str, seed: int) -> World:
     corner = np.array([-whole[0], whole[1], -0.02])
     panels = [
         Panel(corner, np.array([2 * whole[0], 0, 0]), np.array([0, -2 * whole[1], 0]), ground, tiles=(4.0, 3.0)),
-        *avenue.sky(rng, (0.0, 0.0)),
+        *avenue.sky(rng, weather, (0.0, 0.0)),
     ]
     lamps: list[Lamp] = []
-    for a, b in _sides(*BLOCK):
+    for number, (a, b) in enumerate(_sides(*BLOCK)):
         panels += _row(rng, things, a, b, inward=False)
-        more, lights = _furnish(rng, things, a, b, STREET_M)
+        more, lights = _furnish(rng, things, a, b, partial(change, seed, run, number))
         panels += more
         lamps += lights
         points = a + np.linspace(0, 1, 1 + round(float(np.linalg.norm(b - a)) / avenue.STRIP_M))[:, None] * (b - a)

@@ -5,10 +5,12 @@ same side; a few posters differ, and the passages between them.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from seamark.datasets_synth import floor_plan, prints
+from seamark.datasets_synth.clutter import change
 from seamark.datasets_synth.floor_plan import WALL_PIXELS_PER_METRE, Space
 from seamark.datasets_synth.panels import Panel, moved
 from seamark.datasets_synth.route import Route
@@ -51,14 +53,15 @@ def _with_other_posters(rng: np.random.Generator, panel: Panel) -> Panel:
     return replace(panel, image=image)
 
 
-def build_twins(_: str, seed: int) -> World:
-    """Return the world."""
+def build_twins(_: str, seed: int, run: int = 0) -> World:
+    """Return the world; ``run`` moves a few light things, in both corridors alike."""
     corridor, east, west = _spaces()
     middle = (OUTER_M + INNER_M) / 2
     rng = np.random.default_rng([seed, 0x7214])
     along = np.column_stack([np.linspace(-HALF_LENGTH_M, HALF_LENGTH_M, 200), np.full(200, middle)])
     walls = floor_plan.walls(rng, corridor, [east, west])
-    rest = floor_plan.floor_and_ceiling(rng, corridor) + floor_plan.furniture(rng, corridor, along, FURNITURE)
+    rest, footprints = floor_plan.furniture(rng, corridor, along, FURNITURE, partial(change, seed, run, 2))
+    rest += floor_plan.floor_and_ceiling(rng, corridor, [east, west], footprints)
     glowing, lights = floor_plan.lamps(rng, corridor)
     rest += glowing
     panels, nowhere = [*walls, *rest], np.zeros(3)
@@ -70,9 +73,10 @@ def build_twins(_: str, seed: int) -> World:
     for number, passage in enumerate((east, west)):
         own = np.random.default_rng([seed, number, 0x7215])
         panels += floor_plan.walls(own, passage, [corridor, twin])
-        panels += floor_plan.floor_and_ceiling(own, passage)
-        x = (passage.west + passage.east) / 2
-        panels += floor_plan.furniture(own, passage, across + np.array([x, 0.0]), FURNITURE // 2)
+        way = across + np.array([(passage.west + passage.east) / 2, 0.0])
+        became = partial(change, seed, run, number)
+        boxes, footprints = floor_plan.furniture(own, passage, way, FURNITURE // 2, became)
+        panels += [*boxes, *floor_plan.floor_and_ceiling(own, passage, [corridor, twin], footprints)]
         glowing, lights = floor_plan.lamps(own, passage)
         panels += glowing
         lamps += lights
