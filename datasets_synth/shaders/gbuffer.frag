@@ -70,7 +70,7 @@ float mirrored(vec3 n, vec3 l, vec3 e) {
   float squared = pow(material.roughness, 4), k = (material.roughness + 1) * (material.roughness + 1) / 8;
   float spread = nh * nh * (squared - 1) + 1;
   float along = FULL_SPECULAR * material.fresnel;
-  float reflectance = along + (1 - along) * pow(1 - eh, 5);
+  float reflectance = along + (1 - along) * pow(max(1 - eh, 0), 5);
   float distribution = squared / (PI * spread * spread);
   return reflectance * distribution * nl / (4 * (nl * (1 - k) + k) * (ne * (1 - k) + k));
 }
