@@ -4,7 +4,7 @@ Two frames show the same place where they share visible surface, as in A. Pion e
 visual localization", 3DV 2020 (frustum overlap) but with occlusion: distance alone calls two sides of a wall one place.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark import SeamarkError
+from seamark.datasets_synth.figures import FIRST_PERSON
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 
@@ -30,18 +31,40 @@ def _pixels(camera: Camera) -> Array:
     return np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
 
 
-def flow(depth: DepthImage, camera: Camera, T_world_a: Array, T_world_b: Array) -> NDArray[np.float32]:
+def flow(
+    depth: DepthImage,
+    camera: Camera,
+    T_world_a: Array,
+    T_world_b: Array,
+    labels: NDArray[np.uint8] | None = None,
+    displacements: Mapping[int, Array] | None = None,
+) -> NDArray[np.float32]:
     """Return where the pixels of frame a are in frame b, minus where they were: (H, W, 2) float32 px.
 
     ``depth`` (H, W) is of frame a in m along the optical axis. NaN where it is unknown (0, not finite) or the point is
     behind camera b; pixels that another surface hides in b have their flow nevertheless (``visible`` tells them).
+
+    Without ``labels`` (H, W) of frame a everything counts as standing still. With them what moves by itself has its own
+    flow: ``displacements`` gives by label the motion (4, 4) of its points in the world from a to b, as
+    ``people.People.displacements`` does for labels=2; NaN where a label from figures.FIRST_PERSON on is not among them.
     """
     if depth.shape != (camera.height, camera.width):
         raise SeamarkError(f"depth is {depth.shape}, the camera {camera.width}x{camera.height}")
     pixels = _pixels(camera)
     z = depth.reshape(-1).astype(np.float64)
     known = np.isfinite(z) & (z > 0)
-    moved = se3.transform(se3.inverse(T_world_b) @ T_world_a, camera.rays(pixels[known]) * z[known, None])
+    if labels is not None:
+        if labels.shape != depth.shape:
+            raise SeamarkError(f"labels are {labels.shape}, depth is {depth.shape}")
+        moving = np.ones(256, np.bool_)
+        moving[:FIRST_PERSON] = moving[list(displacements or {})] = False
+        known &= ~moving[labels.reshape(-1)]  # how these move is not known
+    world = se3.transform(T_world_a, camera.rays(pixels[known]) * z[known, None])
+    if labels is not None:
+        shown = labels.reshape(-1)[known]
+        for label, T in (displacements or {}).items():
+            world[shown == label] = se3.transform(T, world[shown == label])
+    moved = se3.transform(se3.inverse(T_world_b), world)
     ahead = moved[:, 2] > NEAR_M
     out = np.full((len(z), 2), np.nan, np.float32)
     where = np.flatnonzero(known)[ahead]

@@ -2,9 +2,11 @@
 
 Distortion is the radial-tangential model of D. Brown (1966) in OpenCV's order; the world is drawn undistorted and
 larger, then mapped. Motion blur moves every pixel along its own image motion during the shutter time, which is known
-from depth and the motion of the camera.
+from depth, the motion of the camera and that of what moves by itself. The latter is a layer of its own, as in M.
+McGuire et al., "A reconstruction filter for plausible motion blur", I3D 2012, which smears over what lies behind it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +18,7 @@ from seamark.frontend.camera import Camera
 
 Colour = NDArray[np.float32]
 Depth = NDArray[np.float32]
+Motion = NDArray[np.float32]
 
 GAMMA = 2.2  # of the renderer's shader
 LEAST_EXPOSURE = 0.25
@@ -133,9 +136,14 @@ class Lens:
         return np.asarray(cv2.remap(labels, *self._maps, cv2.INTER_NEAREST), np.uint8)
 
 
-def image_motion(camera: Camera, depth: Depth, T_later_now: se3.Matrix) -> NDArray[np.float32]:
+def image_motion(camera: Camera, depth: Depth, T_later_now: se3.Matrix) -> Motion:
     """Return where pixels of static things move (H, W, 2) px until ``later``; no depth counts as far away."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
+    return _motion_at(camera, x, y, depth, T_later_now)
+
+
+def _motion_at(camera: Camera, x: Depth, y: Depth, depth: Depth, T_later_now: se3.Matrix) -> Motion:
+    """Return how pixels (...) move, (..., 2) px, whose points move by T_later_now in the frame of the camera."""
     ray_x = (x - np.float32(camera.cx)) / np.float32(camera.fx)
     ray_y = (y - np.float32(camera.cy)) / np.float32(camera.fy)
     inverse = np.where(depth > 0, 1 / np.maximum(depth, np.float32(BEHIND_M)), 0).astype(np.float32)
@@ -144,17 +152,72 @@ def image_motion(camera: Camera, depth: Depth, T_later_now: se3.Matrix) -> NDArr
     ahead = np.maximum(ahead, np.float32(BEHIND_M))
     right = (R[0, 0] * ray_x + R[0, 1] * ray_y + R[0, 2] + t[0] * inverse) / ahead
     down = (R[1, 0] * ray_x + R[1, 1] * ray_y + R[1, 2] + t[1] * inverse) / ahead
-    motion: NDArray[np.float32] = np.stack(
+    motion: Motion = np.stack(
         [(right - ray_x) * np.float32(camera.fx), (down - ray_y) * np.float32(camera.fy)], axis=-1
     )
     return motion
 
 
-def blur(picture: Colour, motion: NDArray[np.float32]) -> Colour:
+def moving_motion(
+    camera: Camera, depth: Depth, labels: NDArray[np.uint8], parts: Mapping[int, se3.Matrix]
+) -> tuple[Motion, NDArray[np.bool_]] | None:
+    """Return how the pixels of moving parts move, (H, W, 2) px, and which they are (H, W); None where there are none.
+
+    ``parts`` gives by label the motion T_later_now of a part in the frame of the camera, which itself may move. Around
+    the parts the motion of their nearest pixel goes on, because that is what is smeared over what lies behind them.
+    """
+    table = np.zeros(256, np.bool_)
+    table[list(parts)] = True
+    mask = table[labels]
+    if not mask.any():
+        return None
+    seeds = np.zeros((*labels.shape, 2), np.float32)
+    for number in np.unique(labels[mask]).tolist():
+        rows, columns = np.nonzero(labels == number)
+        at = columns.astype(np.float32), rows.astype(np.float32)
+        seeds[rows, columns] = _motion_at(camera, *at, depth[rows, columns], parts[number])
+    _, nearest = cv2.distanceTransformWithLabels(
+        np.where(mask, 0, 255).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_number = np.zeros((int(nearest.max()) + 1, 2), np.float32)
+    by_number[nearest[mask]] = seeds[mask]
+    return by_number[nearest], mask
+
+
+def blur(picture: Colour, motion: Motion) -> Colour:
     """Return the picture (H, W, 3) as seen while every pixel moves by ``motion`` (H, W, 2) px about where it is."""
-    longest = float(np.percentile(np.abs(motion[::8, ::8]).max(axis=-1), 95))
+    longest = _longest(motion[::8, ::8])
     if longest < LEAST_BLUR_PX:
         return picture
+    return _smeared(picture, motion, longest)
+
+
+def blur_moving(picture: Colour, motion: Motion, moving: Motion, mask: NDArray[np.bool_]) -> Colour:
+    """Return the picture with what moves by itself, ``mask`` (H, W), smeared along ``moving`` over the rest.
+
+    Both layers are blurred along their own motion (H, W, 2) px, and what moves covers the rest for the share of the
+    time that it is there; the rest has nothing of it mixed in.
+    """
+    longest, longest_moving = _longest(motion[::8, ::8]), _longest(moving[mask][::16])
+    if max(longest, longest_moving) < LEAST_BLUR_PX:
+        return picture
+    inside = mask.astype(np.float32)[..., None]
+    outside = 1 - inside
+    behind = _smeared(np.concatenate([picture * outside, outside], axis=-1), motion, longest)
+    in_front = _smeared(np.concatenate([picture * inside, inside], axis=-1), moving, longest_moving)
+    known = behind[..., 3:]
+    rest = np.where(known > 1e-3, behind[..., :3] / np.maximum(known, np.float32(1e-3)), picture)
+    blurred: Colour = in_front[..., :3] + (1 - in_front[..., 3:]) * rest
+    return blurred
+
+
+def _longest(motion: Motion) -> float:
+    """Return how far pixels move, but for the fastest of them."""
+    return float(np.percentile(np.abs(motion).max(axis=-1), 95))
+
+
+def _smeared(picture: Colour, motion: Motion, longest: float) -> Colour:
+    """Return the mean of the picture (H, W, C) over the motion, in as many steps as ``longest`` px take."""
     height, width = picture.shape[:2]
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     taps = int(np.clip(np.ceil(longest), 2, BLUR_TAPS))
@@ -162,5 +225,5 @@ def blur(picture: Colour, motion: NDArray[np.float32]) -> Colour:
     for at in (np.arange(taps) + 0.5) / taps - 0.5:
         column, row = x + np.float32(at) * motion[..., 0], y + np.float32(at) * motion[..., 1]
         total += cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    blurred: Colour = total / np.float32(taps)
-    return blurred
+    smeared: Colour = total / np.float32(taps)
+    return smeared

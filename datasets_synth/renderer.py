@@ -2,7 +2,7 @@
 
 SAPIEN counts pixel centres at +0.5, so half a pixel is added to the principal point; its camera looks along x with y
 left and z up. Only this module and the probe import sapien, and only when a renderer is made. The shaders are our own
-(``shaders/``): a third of the cost of SAPIEN's, and they start at once.
+(``shaders/``): a quarter of the cost of SAPIEN's, and they start at once.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.datasets_synth import figures
+from seamark.datasets_synth.figures import Figure, Mesh
 from seamark.datasets_synth.lighting import DAY, Illumination
 from seamark.datasets_synth.optics import GAMMA
 from seamark.datasets_synth.panels import Panel, Vector
@@ -26,7 +28,7 @@ NEAR_M = 0.05
 MIPMAP_LEVELS = 8
 METER_SCALE = 10  # the picture that exposure is metered on is so many times smaller
 NOWHERE = np.array([0.0, 0.0, -500.0])  # where movers wait that are not there
-LABEL_NOTHING, LABEL_STATIC, LABEL_SKY, LABEL_MOVER = 0, 1, 2, 10
+LABEL_NOTHING, LABEL_STATIC, LABEL_SKY = 0, 1, 2
 
 Colour = NDArray[np.float32]
 
@@ -45,13 +47,16 @@ def devices() -> str:
 class View:
     """What the rig sees: BGR (H, W, 3) float32 in 0..255, gamma coded, and z depth (H, W) m of the left camera.
 
-    Depth 0 is nothing. ``labels`` (H, W) uint8, if asked for: 0 nothing, 1 static, 2 sky, 10 + k mover k.
+    Depth 0 is nothing. ``labels`` (H, W) uint8, if asked for: 0 nothing, 1 static, 2 sky, and parts of people as in
+    figures.label. ``right_depth`` and ``right_labels`` come if asked for.
     """
 
     left: Colour
     depth: NDArray[np.float32]
     right: Colour | None = None
     labels: NDArray[np.uint8] | None = None
+    right_depth: NDArray[np.float32] | None = None
+    right_labels: NDArray[np.uint8] | None = None
 
 
 def _pose(T_world_cam: se3.Matrix) -> Any:
@@ -76,7 +81,8 @@ def _material(panel: Panel) -> Any:
         material.emission_texture = texture
     else:
         material.base_color_texture = texture
-    material.specular = 0.0  # the shader leaves out what is matte
+    material.roughness = 0.95 - 0.75 * panel.gloss
+    material.specular = 0.05 + 0.95 * panel.gloss if panel.gloss > 0 else 0.0  # the shader leaves out what is matte
     return material
 
 
@@ -93,6 +99,15 @@ def _mesh(panels: Sequence[Panel], material: Any) -> Any:
     return sr.RenderShapeTriangleMesh(corners, triangles, normals, places, material)
 
 
+def _figure_mesh(mesh: Mesh) -> Any:
+    """Return a mesh of somebody in matt cloth."""
+    import sapien.render as sr
+
+    corner = np.zeros(3)
+    material = _material(Panel(corner, corner, corner, mesh.image))
+    return sr.RenderShapeTriangleMesh(mesh.vertices, mesh.triangles, mesh.normals, mesh.places, material)
+
+
 def _by_picture(panels: Sequence[Panel]) -> list[list[Panel]]:
     """Return the panels in groups that share picture and light, in order of their first."""
     groups: dict[tuple[int, float, bool], list[Panel]] = {}
@@ -104,14 +119,14 @@ def _by_picture(panels: Sequence[Panel]) -> list[list[Panel]]:
 class Renderer:
     """A world in front of a rig; raises ImportError or RuntimeError where sapien or a Vulkan device is missing.
 
-    ``movers`` are things of panels about their own origin; :meth:`place` moves them.
+    ``movers`` are people; :meth:`place` moves them.
     """
 
-    def __init__(self, world: World, rig: Rig, movers: Sequence[Sequence[Panel]] = (), *, meter: bool = False) -> None:
+    def __init__(self, world: World, rig: Rig, movers: Sequence[Figure] = (), *, meter: bool = False) -> None:
         import sapien
 
         sapien.set_log_level("error")
-        most = len(world.panels) + sum(len(mover) for mover in movers) + 64
+        most = len(world.panels) + sum(len(part.meshes) for mover in movers for part in mover.parts) + 64
         sapien.render.set_global_config(
             max_num_materials=most, max_num_textures=most, default_mipmap_levels=MIPMAP_LEVELS
         )
@@ -123,7 +138,13 @@ class Renderer:
         self._labels = np.zeros(1, np.uint8)
         for group in _by_picture(world.panels):
             self._add([group], LABEL_SKY if group[0].sky and world.sun is not None else LABEL_STATIC)
-        self._movers = [self._add(_by_picture(mover), LABEL_MOVER + k) for k, mover in enumerate(movers)]
+        self._movers = [
+            [
+                self._enter([_figure_mesh(mesh) for mesh in part.meshes], figures.label(k, number))
+                for number, part in enumerate(mover.parts)
+            ]
+            for k, mover in enumerate(movers)
+        ]
         shown = world.lamps[: world.lamps_at_once] if world.lamps_at_once else world.lamps
         self._lamps = [
             self._scene.add_point_light(lamp.position.tolist(), list(lamp.colour), shadow=False) for lamp in shown
@@ -140,15 +161,22 @@ class Renderer:
         self._T_left_right = rig.T_cam0_cam1
 
     def _add(self, groups: Sequence[Sequence[Panel]], label: int) -> Any:
-        import sapien
-
-        entity, body = sapien.Entity(), sapien.render.RenderBodyComponent()
+        meshes = []
         for group in groups:
             material = _material(group[0])
             if group[0].glow > 0 or group[0].sky:
                 self._glowing.append((material, group[0], len(group) == 1 and self._is_odd(group[0])))
                 self._glow(*self._glowing[-1], DAY)
-            body.attach(_mesh(group, material))
+            meshes.append(_mesh(group, material))
+        return self._enter(meshes, label)
+
+    def _enter(self, meshes: Sequence[Any], label: int) -> Any:
+        """Put meshes into the scene as one thing."""
+        import sapien
+
+        entity, body = sapien.Entity(), sapien.render.RenderBodyComponent()
+        for mesh in meshes:
+            body.attach(mesh)
         entity.add_component(body)
         self._scene.add_entity(entity)
         if entity.per_scene_id >= len(self._labels):
@@ -195,12 +223,16 @@ class Renderer:
         for material, panel, odd in self._glowing:
             self._glow(material, panel, odd, light)
 
-    def place(self, mover: int, position: Vector | None, yaw: float = 0.0) -> None:
-        """Put a mover's origin to ``position`` (3,) m, turned about z; None takes it out of the world."""
+    def place(self, mover: int, T_world_part: se3.Matrix | None) -> None:
+        """Put the parts of a mover to their poses (P, 4, 4); None takes it out of the world."""
         import sapien
 
-        where = NOWHERE if position is None else position
-        self._movers[mover].set_pose(sapien.Pose(where, [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+        for number, entity in enumerate(self._movers[mover]):
+            if T_world_part is None:
+                entity.set_pose(_at(NOWHERE))
+                continue
+            x, y, z, w = se3.to_quaternion(T_world_part[number, :3, :3])
+            entity.set_pose(sapien.Pose(T_world_part[number, :3, 3], [w, x, y, z]))
 
     def _choose_lamps(self, eye: Vector) -> None:
         """Light the nearest lamps; the last of them fades out before another takes its place."""
@@ -228,7 +260,9 @@ class Renderer:
             camera.entity.set_pose(_pose(T_world_cam))
         self._scene.update_render()
 
-    def render(self, T_world_cam: se3.Matrix, *, exposure: float = 1.0, labels: bool = False) -> View:
+    def render(
+        self, T_world_cam: se3.Matrix, *, exposure: float = 1.0, labels: bool = False, right_depth: bool = False
+    ) -> View:
         """Return what the rig sees from ``T_world_cam``.
 
         ``exposure`` is a factor on all light; it is applied here and not by SAPIEN, whose cameras leak memory whenever
@@ -240,12 +274,17 @@ class Renderer:
         self._update(T_world_cam, [self._left])
         self._left.take_picture()
         left = self._colour(self._left, gain)
-        entity, depth = cv2.split(self._left.get_picture("Segmentation").view(np.float32))[:2]
-        marked = self._labels[entity.view(np.uint32)] if labels else None
+        depth, marked = self._geometry(self._left, labels)
         if self._right is None:
             return View(left, depth, None, marked)
         self._right.take_picture()
-        return View(left, depth, self._colour(self._right, gain), marked)
+        right_eye = self._geometry(self._right, labels) if right_depth else (None, None)
+        return View(left, depth, self._colour(self._right, gain), marked, *right_eye)
+
+    def _geometry(self, camera: Any, labels: bool) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+        """Return the depth of what a camera saw, and its labels if asked for."""
+        entity, depth = cv2.split(camera.get_picture("Segmentation").view(np.float32))[:2]
+        return depth, self._labels[entity.view(np.uint32)] if labels else None
 
     @staticmethod
     def _colour(camera: Any, gain: float = 1.0) -> Colour:

@@ -102,6 +102,24 @@ SCENARIOS = _numbered(
         "street_day again by night",
     ),
     ("road", "road", "trajectory=once,frames=800,sensors=stereo,camera=real", "no place twice: every loop is false"),
+    (
+        "crowd_rgbd",
+        "loop",
+        "trajectory=loop,frames=780,sensors=rgbd,crowd=40",
+        "people hide up to 40 % of the picture: most of what moves must not be believed",
+    ),
+    (
+        "crowd_stereo",
+        "loop",
+        "trajectory=loop,frames=780,sensors=stereo,camera=real,crowd=40",
+        "the same with motion blur and without a depth camera",
+    ),
+    (
+        "onlooker",
+        "loop",
+        "trajectory=standing,frames=550,sensors=rgbd,crowd=40",
+        "the camera stands while people walk: their motion must not become its own",
+    ),
 )
 
 

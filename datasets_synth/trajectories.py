@@ -69,6 +69,7 @@ KINDS: dict[str, Kind] = {
     "hand_held": Kind("once round with the jitter of a hand", ways.once_round, HAND, 1.3, 4.0, 1.5),
     "six_dof": Kind("once round, rising, sinking, nodding and rolling", ways.once_round, FLIGHT, 1.3, 2.0, 1.2),
     "stop_and_go": Kind("once round with five stops", ways.stop_and_go),
+    "standing": Kind("drive for a moment, stand still for half a minute, drive on", ways.standing),
     "pure_rotation": Kind("drive, turn once round on the spot, twice", ways.pure_rotation),
     "kidnap": Kind("carried away twice, in no time", ways.kidnap),
     "second_traversal": Kind("once round again, aside and looking aside", ways.second_traversal),

@@ -10,6 +10,7 @@ from seamark.datasets_synth.course import TICK_S, Array, Limits
 from seamark.datasets_synth.route import Route
 
 MOST_LANES = 4
+STAND_AFTER_M, STAND_S = 1.6, 30.0
 EIGHT_INSIDE, MOWER_INSIDE = 0.5, 0.65  # how much of the extent of a closed route ways use that leave it
 
 
@@ -107,6 +108,17 @@ def stop_and_go(route: Route, limits: Limits, rng: np.random.Generator) -> list[
     for start, end in itertools.pairwise(stops.tolist()):
         pieces.append(course.drive(course.part(path, start, end), limits))
         pieces.append(course.pause(pieces[-1], rng.uniform(1.0, 2.5)))
+    return [course.joined(pieces)]
+
+
+def standing(route: Route, limits: Limits, _: np.random.Generator) -> list[Array]:
+    """Drive so that a map can begin, stand still for long, drive on."""
+    path = course.lap(route)
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    first, end = (min(share, metres / length) for share, metres in ((0.3, STAND_AFTER_M), (0.6, 2 * STAND_AFTER_M)))
+    pieces = [course.drive(course.part(path, 0, first), limits)]
+    pieces.append(course.pause(pieces[-1], STAND_S))
+    pieces.append(course.drive(course.part(path, first, end), limits))
     return [course.joined(pieces)]
 
 

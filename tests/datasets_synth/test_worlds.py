@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from seamark import SeamarkError
-from seamark.datasets_synth import movers, specification, world_twins
+from seamark.datasets_synth import figures, movers, specification, world_twins
 from seamark.datasets_synth.panels import Panel
 from seamark.datasets_synth.world import World
 from seamark.datasets_synth.worlds import WORLDS
@@ -87,11 +87,11 @@ def test_office_rooms_share_their_pictures(worlds: dict[str, World]) -> None:
 class TestPeople:
     def test_they_are_of_human_size(self) -> None:
         for seed in range(5):
-            panels = movers.person(np.random.default_rng(seed))
-            corners = np.concatenate([panel.corners for panel in panels])
-            assert 1.55 < corners[:, 2].max() < 1.95
-            assert abs(corners[:, 2].min()) < 1e-9
-            assert np.abs(corners[:, :2]).max() < 0.4
+            parts = figures.person(np.random.default_rng(seed)).parts
+            points = np.concatenate([mesh.vertices + part.joint for part in parts for mesh in part.meshes])
+            assert 1.55 < points[:, 2].max() < 1.95
+            assert abs(points[:, 2].min()) < 0.01
+            assert 0.15 < np.abs(points[:, :2]).max() < 0.4
 
     def test_they_walk_without_jumping_and_keep_their_distance(self) -> None:
         poses = specification.parse("loop").poses()
@@ -131,6 +131,8 @@ class TestSettings:
             ("loop,camera=fisheye", "there are ideal, real, barrel"),
             ("loop,movers=9", "from 0 to 3"),
             ("loop,offset=-200", "from -100 to 100"),
+            ("loop,crowd=60", "from 0 to 40"),
+            ("loop,crowd=20,movers=1", "exclude each other"),
         ],
     )
     def test_bad_settings_say_what_exists(self, text: str, message: str) -> None:
@@ -139,5 +141,5 @@ class TestSettings:
 
     def test_every_setting_changes_the_hash(self) -> None:
         texts = ["loop", "twins", "loop,condition=night", "loop,camera=real", "loop,movers=1", "loop,offset=5"]
-        texts += ["loop,run=1", "loop,labels=1", "loop,trajectory=kidnap"]
+        texts += ["loop,run=1", "loop,labels=1", "loop,trajectory=kidnap", "loop,crowd=30", "loop,labels=2"]
         assert len({specification.content_hash(specification.parse(text)) for text in texts}) == len(texts)
