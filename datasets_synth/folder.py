@@ -1,4 +1,7 @@
-"""Rendered sequences on disk in the layout of the TUM RGB-D sets: pictures, lists, ground truth, calibration."""
+"""Rendered sequences on disk in the layout of the TUM RGB-D sets: pictures, lists, ground truth, calibration.
+
+Beside them, where they were asked for, lie labels: which pixels are static, sky, people (renderer.View).
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,17 +26,44 @@ def names(index: int) -> tuple[str, str, str]:
     return f"rgb/{index:06d}.jpg", f"right/{index:06d}.jpg", f"depth/{index:06d}.png"
 
 
-def start(folder: Path, mode: Mode) -> None:
+def labels_name(index: int) -> str:
+    """Return the file of the labels of a frame, relative to the folder."""
+    return f"labels/{index:06d}.png"
+
+
+def start(folder: Path, mode: Mode, *, labels: bool = False) -> None:
     """Make the folder and those inside it for the pictures."""
-    for name in ("rgb", *({Mode.RGBD: ["depth"], Mode.STEREO: ["right"]}.get(mode, []))):
+    for name in _contents(mode, labels):
         (folder / name).mkdir(parents=True, exist_ok=True)
 
 
+def _contents(mode: Mode, labels: bool) -> list[str]:
+    """Return the folders that a frame has a file in."""
+    return ["rgb", *({Mode.RGBD: ["depth"], Mode.STEREO: ["right"]}.get(mode, [])), *(["labels"] if labels else [])]
+
+
 def store(folder: Path, coded: CodedFrame) -> None:
-    """Write the files of one frame."""
-    for name, blob in zip(names(coded.index), (coded.left, coded.right, coded.depth), strict=True):
+    """Write the files of one frame, each so that it is there completely or not at all."""
+    files = zip((*names(coded.index), labels_name(coded.index)), coded.blobs, strict=True)
+    for name, blob in files:
         if blob:
-            (folder / name).write_bytes(blob)
+            fresh = folder / f"{name}.new"
+            fresh.write_bytes(blob)
+            fresh.replace(folder / name)
+
+
+def stored(folder: Path, mode: Mode, *, labels: bool = False) -> int:
+    """Return how many frames, from the first on, have all their files."""
+    kinds = _contents(mode, labels)
+    present = [{file.stem for file in (folder / kind).iterdir() if file.suffix != ".new"} for kind in kinds]
+    whole = set.intersection(*present)
+    return next(index for index in range(len(whole) + 1) if f"{index:06d}" not in whole)
+
+
+def read_coded(folder: Path, index: int) -> CodedFrame:
+    """Return one frame as it was stored; what is missing is empty."""
+    files = [folder / name for name in (*names(index), labels_name(index))]
+    return CodedFrame(index, *(file.read_bytes() if file.is_file() else b"" for file in files))
 
 
 def finish(folder: Path, title: str, mode: Mode, rig: Rig, truth: GroundTruth) -> None:
@@ -73,8 +103,7 @@ def _calibration(rig: Rig, mode: Mode) -> str:
 def read_frames(folder: Path, stamps_ns: NDArray[np.int64]) -> Iterator[Frame]:
     """Yield the frames of a finished folder; raises SeamarkError where a file is missing or cannot be decoded."""
     for index, stamp in enumerate(stamps_ns):
-        blobs = [(folder / name).read_bytes() if (folder / name).is_file() else b"" for name in names(index)]
-        yield decode(CodedFrame(index, *blobs), int(stamp), names(index)[0])
+        yield decode(read_coded(folder, index), int(stamp), names(index)[0])
 
 
 def read_ground_truth(folder: Path) -> GroundTruth:

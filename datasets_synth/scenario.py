@@ -2,15 +2,17 @@
 
 import contextlib
 import os
-import shutil
-import uuid
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from seamark import SeamarkError
-from seamark.datasets_synth import fallback, folder, scenarios, sensor, specification, toy_names, trajectory
+from seamark.datasets_synth import fallback, folder, scenarios, sensor, specification, staging, toy_names, trajectory
 from seamark.datasets_synth.clearance import require_clear
 from seamark.datasets_synth.rendering import NoVulkanDevice, RenderPool, require_renderer
+from seamark.datasets_synth.sensor import CodedFrame
 from seamark.datasets_synth.sequence import GroundTruth, SynthSequence
 from seamark.datasets_synth.specification import Specification
 from seamark.frontend.types import Frame
@@ -53,41 +55,41 @@ def open_synth(spec: str, *, cache_dir: Path | None = None) -> SynthSequence:
     truth = GroundTruth(trajectory.stamps(wanted.frames, specification.FPS), wanted.poses())
 
     def frames() -> Iterator[Frame]:
-        if finished.is_dir():
-            return folder.read_frames(finished, truth.stamps_ns)
-        return _render(wanted, finished, truth)
+        with contextlib.closing(_coded(wanted, finished, truth)) as all_coded:
+            for coded in all_coded:
+                yield sensor.decode(coded, int(truth.stamps_ns[coded.index]), folder.names(coded.index)[0])
+
+    def labels() -> Iterator[NDArray[np.uint8]]:
+        with contextlib.closing(_coded(wanted, finished, truth)) as all_coded:
+            for coded in all_coded:
+                yield sensor.decode_labels(coded, folder.labels_name(coded.index))
 
     name = wanted.world if text == spec else spec.split(",")[0].strip()
-    return SynthSequence(name, wanted.rig, wanted.mode, wanted.frames, truth, frames)
+    shown = labels if wanted.labels else None
+    return SynthSequence(name, wanted.rig, wanted.mode, wanted.frames, truth, frames, shown)
 
 
-def _render(wanted: Specification, finished: Path, truth: GroundTruth) -> Iterator[Frame]:
-    """Yield the frames as they are rendered and, after the last one, move them into the cache as a whole."""
-    partial = finished.with_name(f".partial-{finished.name}-{os.getpid()}-{uuid.uuid4().hex[:8]}")
+def _coded(wanted: Specification, finished: Path, truth: GroundTruth) -> Generator[CodedFrame, None, None]:
+    """Yield the frames from the cache, or else as they are rendered and, after the last one, kept as a whole.
+
+    What a killed process had rendered is not rendered again.
+    """
+    if finished.is_dir():
+        yield from (folder.read_coded(finished, index) for index in range(wanted.frames))
+        return
+    labels = wanted.labels > 0
     try:
-        _remove_leftovers(finished)
-        folder.start(partial, wanted.mode)
-        with RenderPool(wanted) as pool:
-            for coded in pool.frames():
-                folder.store(partial, coded)
-                file = folder.names(coded.index)[0]
-                yield sensor.decode(coded, int(truth.stamps_ns[coded.index]), file)
-        folder.finish(partial, f"seamark synth {wanted}", wanted.mode, wanted.rig, truth)
-        with contextlib.suppress(OSError):  # another run was faster: its folder is as good
-            partial.rename(finished)
+        with staging.growing(finished) as partial:
+            folder.start(partial, wanted.mode, labels=labels)
+            begin = min(folder.stored(partial, wanted.mode, labels=labels), wanted.frames)
+            yield from (folder.read_coded(partial, index) for index in range(begin))
+            if begin < wanted.frames:
+                with RenderPool(wanted, begin) as pool:
+                    for coded in pool.frames():
+                        folder.store(partial, coded)
+                        yield coded
+            folder.finish(partial, f"seamark synth {wanted}", wanted.mode, wanted.rig, truth)
+            with contextlib.suppress(OSError):  # another run was faster: its folder is as good
+                partial.rename(finished)
     except OSError as error:
         raise SeamarkError(f"rendered frames cannot be written to the cache {finished.parent}: {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _remove_leftovers(finished: Path) -> None:
-    """Remove what killed processes have left of this sequence."""
-    for leftover in finished.parent.glob(f".partial-{finished.name}-*"):
-        process = int(leftover.name.split("-")[-2])
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            shutil.rmtree(leftover, ignore_errors=True)
-        except PermissionError:
-            continue

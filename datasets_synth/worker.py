@@ -51,9 +51,8 @@ def _render(job: dict[str, Any], output: BinaryIO) -> None:
     studio = Studio(specification)
     for index in job.get("indices") or range(job["first"], specification.frames, job["step"]):
         coded = studio.frame(index)
-        blobs = (coded.left, coded.right, coded.depth, coded.labels)
-        output.write(HEADER.pack(index, *(len(blob) for blob in blobs)))
-        for blob in blobs:
+        output.write(HEADER.pack(index, *(len(blob) for blob in coded.blobs)))
+        for blob in coded.blobs:
             output.write(blob)
         output.flush()
 

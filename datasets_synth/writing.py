@@ -106,7 +106,7 @@ def write_sequence(
                 for name, content in layout.frame(coded, int(plan.truth.stamps_ns[coded.index])).items():
                     _put(partial / name, content)
                 if coded.labels:
-                    _put(partial / "labels" / f"{coded.index:06d}.png", coded.labels)
+                    _put(partial / folder.labels_name(coded.index), coded.labels)
                 _put(partial / COUNT, str(coded.index + 1).encode())
                 if progress is not None:
                     progress(coded.index + 1, total)
@@ -185,10 +185,8 @@ def _plan_world(text: str, cache_dir: Path | None) -> _Plan:
         require_clear(wanted)
 
     def coded(begin: int) -> Iterator[CodedFrame]:
-        if finished.is_dir() and not wanted.labels:  # which are not kept there
-            for index in range(begin, wanted.frames):
-                files = [finished / name for name in folder.names(index)]
-                yield CodedFrame(index, *(file.read_bytes() if file.is_file() else b"" for file in files))
+        if finished.is_dir():
+            yield from (folder.read_coded(finished, index) for index in range(begin, wanted.frames))
             return
         require_renderer()
         with RenderPool(wanted, begin) as pool:

@@ -89,17 +89,6 @@ def test_a_killed_worker_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
         next(pool.frames())
 
 
-def test_leftovers_of_dead_processes_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _stand_in(monkeypatch)
-    name = specification.content_hash(specification.parse(SPEC.format(2)))
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    leftover = tmp_path / "synth" / f".partial-{name}-{ended.pid}-0"
-    leftover.mkdir(parents=True)
-    list(open_synth(SPEC.format(2), cache_dir=tmp_path).frames())
-    assert [path.name for path in (tmp_path / "synth").iterdir()] == [name]
-
-
 def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _stand_in(monkeypatch)
     (tmp_path / "file").write_text("")
