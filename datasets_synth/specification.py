@@ -32,6 +32,7 @@ IMAGES = {"640x480": (640, 480), "320x240": (320, 240)}
 SENSORS = (Mode.RGBD, Mode.STEREO, Mode.MONO)
 FRAMES = (2, 5000)
 MOST_MOVERS = 3
+MOST_CROWD = 40  # per cent of the picture
 OFFSET_CM = (-100, 100)
 RUNS = 99
 FPS = 15.0
@@ -44,8 +45,9 @@ class Specification:
     """One synthetic sequence, complete: the same specification gives the same bits on one machine.
 
     ``seed`` draws the world; ``run`` above 0 draws another motion, other people and other noise in the same world.
-    ``offset`` shifts the camera to its left by so many cm along the whole trajectory. ``movers`` people walk about.
-    ``labels`` 1 adds labels to what a worker sends (renderer.View); it changes nothing else.
+    ``offset`` shifts the camera to its left by so many cm along the whole trajectory. ``movers`` people walk about;
+    ``crowd`` is the share of the picture in per cent that people come to hide, as many as that takes. ``labels`` adds
+    labels to what a worker sends, 1 of people, 2 of their parts (figures.label); it changes nothing else.
     """
 
     world: str
@@ -62,6 +64,7 @@ class Specification:
     offset: int = 0
     run: int = 0
     labels: int = 0
+    crowd: int = 0
 
     @property
     def motion_seed(self) -> int:
@@ -135,7 +138,8 @@ PARSERS: dict[str, Callable[[str, str], str | int]] = {
     "movers": _number(0, MOST_MOVERS),
     "offset": _number(*OFFSET_CM),
     "run": _number(0, RUNS),
-    "labels": _number(0, 1),
+    "labels": _number(0, 2),
+    "crowd": _number(0, MOST_CROWD),
 }
 
 
@@ -160,6 +164,8 @@ def parse(text: str) -> Specification:
     specification = Specification(world, **values)  # type: ignore[arg-type]
     if specification.size not in kind.sizes:
         raise SeamarkError(f"synthetic world {world} has no size={specification.size}, only {', '.join(kind.sizes)}")
+    if specification.movers and specification.crowd:
+        raise SeamarkError("movers and crowd exclude each other: a crowd has as many people as its share takes")
     if specification.trajectory == LAP and kind.trajectory != LAP:
         raise SeamarkError(f"trajectory=lap belongs to the world loop; in {world} it is called {kind.trajectory}")
     return specification
