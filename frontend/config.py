@@ -31,6 +31,9 @@ class FrontendConfig(BaseModel):
     depth_sigma_floor_m: float = Field(0.003, gt=0, description="sigma of an RGB-D reading at no distance")
     depth_sigma_per_m2: float = Field(0.0035, gt=0, description="sigma of a reading at z metres is floor + this * z^2")
     disparity_sigma_px: float = Field(0.4, gt=0, description="standard deviation of a stereo match")
+    disparity_systematic_px: float = Field(
+        0.3, ge=0, description="expected error of the rig's calibration, in disparity; learned on the way, 0: is none"
+    )
     min_disparity_px: float = Field(0.5, gt=0, description="stereo matches with less are taken as unknown")
 
     # Keyframes and the local window

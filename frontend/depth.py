@@ -26,7 +26,10 @@ class DepthSensor(Protocol):
     """Gives inverse depths of pixels of ``Frame.image``.
 
     A sensor keeps nothing between calls: the tracker and the keyframe thread ask the same one at the same time.
+    ``systematic_sigma`` (1/m) is how far readings may be wrong in the same way in every frame, 0 for not at all.
     """
+
+    systematic_sigma: float
 
     def inverse_depth(
         self, frame: Frame, points: NDArray[np.floating]
@@ -38,6 +41,8 @@ class DepthSensor(Protocol):
 class NoDepth:
     """Mono: depth comes from motion only."""
 
+    systematic_sigma = 0.0
+
     def inverse_depth(
         self, frame: Frame, points: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -47,6 +52,8 @@ class NoDepth:
 
 class DepthImage:
     """RGB-D: the registered depth image, the median of 3x3 pixels, without points on depth edges."""
+
+    systematic_sigma = 0.0
 
     def __init__(self, rig: Rig, config: FrontendConfig) -> None:
         self._depth_factor = rig.depth_factor
@@ -90,6 +97,7 @@ class StereoPair:
         self._T_right_left = se3.inverse(rig.T_cam0_cam1)
         self._config = config
         self._baseline_m = float(np.linalg.norm(rig.T_cam0_cam1[:3, 3]))
+        self.systematic_sigma = config.disparity_systematic_px / (rig.cam0.fx * self._baseline_m)
         R, t = self._T_right_left[:3, :3], self._T_right_left[:3, 3]
         self._essential = se3.hat(t) @ R
 

@@ -18,12 +18,14 @@ from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import DepthSensor
+from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import extract_features, match_descriptors, thumbnail_of
 from seamark.frontend.two_view import triangulate
 from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
 MAX_PENDING = 4
 TRIANGULATION_PX = 2.0
+NO_OFFSET = DepthOffset.expected(0.0)
 RELATIVE_SIGMA = 0.2  # a landmark whose depth is less sure than this is not worth keeping
 
 
@@ -37,6 +39,7 @@ class KeyframeRequest:
     previous_id: int | None
     T_odom_cam: NDArray[np.float64] | None
     covariance: NDArray[np.float64] | None
+    depth_offset: DepthOffset
 
 
 class KeyframeBuilder:
@@ -58,9 +61,10 @@ class KeyframeBuilder:
         previous_id: int | None = None,
         T_odom_cam: NDArray[np.float64] | None = None,
         covariance: NDArray[np.float64] | None = None,
+        depth_offset: DepthOffset = NO_OFFSET,
     ) -> KeyframeRequest:
         """Number a decided keyframe; it is made once it is submitted."""
-        request = KeyframeRequest(frame, self.next_id, session, previous_id, T_odom_cam, covariance)
+        request = KeyframeRequest(frame, self.next_id, session, previous_id, T_odom_cam, covariance, depth_offset)
         self.next_id += 1
         return request
 
@@ -124,7 +128,7 @@ class KeyframeBuilder:
             stamp_ns=frame.stamp_ns,
             file=frame.file,
             features=features,
-            landmarks=self._landmarks(frame, features),
+            landmarks=self._landmarks(frame, features, request.depth_offset),
             thumbnail=thumbnail_of(frame.image, c.thumbnail_px),
             jpeg=jpeg.tobytes(),
             camera=self._camera_of(frame),
@@ -139,11 +143,12 @@ class KeyframeBuilder:
         camera = None if self._rig is None else self._rig.cam0
         return camera if camera is not None and (camera.height, camera.width) == frame.image.shape[:2] else None
 
-    def _landmarks(self, frame: Frame, features: Features) -> NDArray[np.float32]:
+    def _landmarks(self, frame: Frame, features: Features, offset: DepthOffset) -> NDArray[np.float32]:
         unknown = np.full((len(features), 3), np.nan, np.float32)
         if self._rig is None or len(features) == 0:
             return unknown
         inverse, sigma = self._sensor.inverse_depth(frame, features.points)
+        inverse = offset.correct(inverse)
         with np.errstate(invalid="ignore", divide="ignore"):
             depth = np.where(sigma < RELATIVE_SIGMA * inverse, 1 / inverse, np.nan)
         return (self._rig.cam0.rays(features.points) * depth[:, None]).astype(np.float32)

@@ -12,6 +12,7 @@ from seamark.frontend.admission import refusal
 from seamark.frontend.camera import CalibrationError
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import NoDepth, make_depth_sensor
+from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import grey_of
 from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.monocular import MonoInitialiser, insert_first_keyframes
@@ -64,6 +65,7 @@ class Frontend:
             _check_pair(rig)
         self._rig, self._mode, self._config, self._clock = rig, mode, config, clock
         self._sensor = make_depth_sensor(rig, mode, config) if rig is not None else NoDepth()
+        self._depth_offset = DepthOffset.expected(self._sensor.systematic_sigma)
         self._builder = KeyframeBuilder(rig, mode, config, self._sensor)
         self._session: Session | None = None
         self._initialiser: MonoInitialiser | None = None
@@ -152,7 +154,7 @@ class Frontend:
         if previous is not None and covariance is not None:
             motion = motion_covariance(previous.T_odom_cam, session.T_odom_cam, covariance)
         request = self._builder.request(
-            frame, session.id, previous.id if previous else None, session.T_odom_cam, motion
+            frame, session.id, previous.id if previous else None, session.T_odom_cam, motion, session.depth_offset
         )
         self._builder.submit([request])
         return request.id
@@ -161,7 +163,9 @@ class Frontend:
         """Begin a session where there is enough to see; its odometry goes on from where the last one ended."""
         assert self._rig is not None
         mono = self._mode is Mode.MONO
-        session = Session(self._next_session, self._config, self._rig.cam0, not mono, self._T_odom_start)
+        session = Session(
+            self._next_session, self._config, self._rig.cam0, not mono, self._T_odom_start, self._depth_offset
+        )
         session.add_corners(grey)
         inverse, _ = self._sensor.inverse_depth(frame, session.tracks.pixels)
         usable = len(session.tracks) if mono else int(np.isfinite(inverse).sum())
@@ -236,7 +240,7 @@ class Frontend:
         session.velocity = np.eye(4)
         if frame.stamp_ns - session.last_pose_stamp_ns < 1e9 * self._config.patience_s:
             return report(frame, Outcome.LOST, Quality.LOST, session=session.id)
-        self._T_odom_start = session.T_odom_cam
+        self._T_odom_start, self._depth_offset = session.T_odom_cam, session.depth_offset
         self._session = None
         return self._start(frame, grey)
 

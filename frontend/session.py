@@ -9,6 +9,7 @@ from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.corners import detect_corners
+from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.pose import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import Tracks
@@ -32,6 +33,7 @@ class Session:
     camera: Camera
     metric: bool
     T_odom_cam: NDArray[np.float64]
+    depth_offset: DepthOffset
     tracks: Tracks = field(default_factory=Tracks.none)
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     window: list[WindowKeyframe] = field(default_factory=list)
@@ -80,6 +82,7 @@ class Session:
         positions = self.landmarks.get(tracks.ids)
         known = np.isfinite(positions[:, 0])
         pixels = self.camera.undistort(tracks.pixels)
+        inverse_depth = self.depth_offset.correct(inverse_depth)
         return Observations(positions[known], pixels[known], inverse_depth[known], inverse_sigma[known]), known
 
     def revisit(self, grey: NDArray[np.uint8]) -> None:
@@ -127,8 +130,9 @@ class Session:
         missing = np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
         with np.errstate(invalid="ignore"):
             usable = missing & (newest.inverse_sigma < FAR_RELATIVE_SIGMA * newest.inverse_depth)
-        rays = normalised_rays(newest.pixels[usable], self.camera)
-        positions = se3.transform(newest.T_odom_cam, rays / newest.inverse_depth[usable, None])
+        pixels = newest.pixels[usable]
+        inverse = self.depth_offset.correct(newest.inverse_depth[usable])
+        positions = se3.transform(newest.T_odom_cam, normalised_rays(pixels, self.camera) / inverse[:, None])
         self.landmarks.set(newest.track_ids[usable], positions)
 
     def _landmarks_from_parallax(self) -> None:
@@ -178,6 +182,9 @@ class Session:
         self.landmarks.set(track_ids, positions)
         adjusted = result.poses[len(self.anchors) :]
         self.window = [replace(k, T_odom_cam=T) for k, T in zip(self.window, adjusted, strict=True)]
+        # each observation is in as many windows as there are keyframes in one
+        information = result.depth_information / c.window_keyframes
+        self.depth_offset = self.depth_offset.learned(result.depth_offset, information)
 
     def _bundle_problem(
         self, views: list[WindowKeyframe], n_fixed: int
@@ -206,5 +213,6 @@ class Session:
             keyframe_of=keyframe_of[use],
             landmark_of=renumber[landmark_of[use]],
             measured=measured,
+            depth_offset=self.depth_offset,
         )
         return problem, unique[wanted]

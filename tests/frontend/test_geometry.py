@@ -1,11 +1,14 @@
 """Pose, triangulation, two views and the window against scenes made in numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from seamark.frontend import se3
 from seamark.frontend.camera import CalibrationError, Camera, Rig
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.pose import Observations, estimate_pose, pose_jacobian, residuals_and_jacobian, retract
 from seamark.frontend.session import Session
 from seamark.frontend.two_view import initialise, triangulate
@@ -171,6 +174,7 @@ def window_problem() -> tuple[BundleProblem, np.ndarray, np.ndarray]:
         np.repeat(np.arange(5), 120)[order],
         landmark_of[order],
         Observations(np.zeros((600, 3)), pixels[order], depths[order], np.full(600, 0.002)),
+        DepthOffset.expected(0.0),
     )
     return problem, true, points
 
@@ -191,6 +195,21 @@ def test_window_stays_as_it_is_where_it_cannot_be_solved(monkeypatch: pytest.Mon
     result = adjust(problem, CAMERA, pixel_sigma=0.3, iterations=12)
     np.testing.assert_allclose(result.poses, problem.poses, atol=1e-12)
     np.testing.assert_array_equal(result.landmarks, problem.landmarks)
+    assert result.depth_information == 0
+
+
+def test_window_learns_an_offset_of_the_depths() -> None:
+    problem, true, _ = window_problem()
+    wrong = replace(problem.measured, inverse_depth=problem.measured.inverse_depth - 0.03)
+    taken_as_read = adjust(replace(problem, measured=wrong), CAMERA, pixel_sigma=0.3, iterations=12)
+    expected = DepthOffset.expected(0.05)
+    learned = adjust(replace(problem, measured=wrong, depth_offset=expected), CAMERA, pixel_sigma=0.3, iterations=12)
+    step, too_long = (np.linalg.norm(p[4, :3, 3] - p[0, :3, 3]) for p in (true, taken_as_read.poses))
+    assert 1.01 * step < too_long < 1.05 * step
+    sigma = (learned.depth_information + expected.information) ** -0.5
+    assert 1e-5 < sigma < 0.01
+    assert abs(learned.depth_offset - 0.03) < 4 * sigma
+    assert np.linalg.norm(learned.poses[4, :3, 3] - learned.poses[0, :3, 3]) == pytest.approx(step, rel=0.008)
 
 
 def test_landmark_table_holds_what_it_is_told_to_keep() -> None:
@@ -208,7 +227,7 @@ def test_landmark_table_holds_what_it_is_told_to_keep() -> None:
 def test_a_track_that_never_ends_does_not_make_a_session_grow() -> None:
     """Test: dirt on the lens is tracked for 80 keyframes, all else for 3. Expected: the state stays bounded."""
     config = FrontendConfig(window_keyframes=3, window_iterations=1, archive_keyframes=2)
-    session = Session(0, config, CAMERA, True, np.eye(4))
+    session = Session(0, config, CAMERA, True, np.eye(4), DepthOffset.expected(0.0))
     grey = np.zeros((480, 640), np.uint8)
     rng = np.random.default_rng(6)
     for k in range(80):
