@@ -1,4 +1,4 @@
-"""What belongs to buildings: radiators, notice boards, doors, and the fronts of houses with windows that repeat.
+"""What belongs to buildings: radiators, boards, doors, and the fronts of houses with windows that repeat.
 
 Same manners as :mod:`seamark.datasets_synth.textures`: a random generator and a size in, BGR uint8 (height, width, 3)
 out.
@@ -38,6 +38,20 @@ def notice_board(rng: np.random.Generator, height: int, width: int) -> Image:
         cv2.rectangle(sheet, (0, 0), (wide - 1, tall - 1), (150, 150, 150), 1)
         canvas[y : y + tall, x : x + wide] = sheet[: height - y, : width - x]
     cv2.rectangle(canvas, (0, 0), (width - 1, height - 1), (70, 80, 90), max(2, height // 40))
+    return canvas
+
+
+def whiteboard(rng: np.random.Generator, height: int, width: int) -> Image:
+    """Return a whiteboard: what was wiped off badly, and writing and sketches on top."""
+    canvas = to_image(tint(np.array([222.0, 224.0, 224.0]), 0.02 * noise(rng, height, width, height / 2, 4)))
+    for _ in range(int(rng.integers(2, 5))):
+        box = (int(rng.uniform(0.03, 0.6) * width), int(rng.uniform(0, 0.6) * height), width // 3, height // 3)
+        prints.draw_text(rng, canvas, box, 0.09 * height)
+    for _ in range(int(rng.integers(2, 6))):
+        path = np.cumsum(rng.normal(0, 0.06 * height, (6, 2)), axis=0) + rng.uniform(0.2, 0.8, 2) * (width, height)
+        colour = [float(shade) for shade in rng.uniform(20, 170, 3)]
+        cv2.polylines(canvas, [path.astype(np.int32)], bool(rng.random() < 0.5), colour, 2, cv2.LINE_AA)
+    cv2.rectangle(canvas, (0, 0), (width - 1, height - 1), (150, 152, 152), max(2, height // 30))
     return canvas
 
 

@@ -18,7 +18,7 @@ CLEARANCE_M = 0.75  # between the path and anything that stands on the floor
 LIGHT_M = 1.0  # what is lower than that gets moved between runs
 WALL_CONTRAST, FLOOR_CONTRAST = (0.4, 0.8), (0.45, 0.8)  # of all others, as worn as they are
 SATURATION = 0.6  # of prints and furniture
-GLOSS = (0.3, 0.9)  # of floors
+POLISHED, GLOSS = 0.6, (0.3, 0.9)  # how many floors shine, and how much
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -175,7 +175,7 @@ def floor_and_ceiling(
     outlines = [(thing - (space.west, space.north)) * (scale, -scale) for thing in things]
     ground = shading.shaded(_ground(rng, shape, scale, finish), corners, shading.contact(*shape, scale, outlines))
     above = shading.shaded(plain.ceiling(rng, *shape, scale), corners[::-1])
-    gloss = float(rng.uniform(*GLOSS))
+    gloss = float(rng.uniform(*GLOSS)) if rng.random() < POLISHED else 0.0
     floor = Panel(np.array([space.west, space.north, 0.0]), across, -deep, ground, gloss=gloss)
     return [floor, Panel(np.array([space.west, space.south, space.height]), across, deep, above)]
 
@@ -218,6 +218,23 @@ def _footprint(centre: Vector, size: Vector, yaw: float) -> Footprint:
     return np.asarray(corners @ np.array([[c, s], [-s, c]]) + centre[:2])
 
 
+def _somewhere(rng: np.random.Generator, space: Space) -> tuple[Vector, Vector, float, tuple[Vector, Vector]]:
+    """Return the size of a box, where it may stand (centre and yaw), and the directions along the wall and inward."""
+    size = np.array([rng.uniform(0.3, 1.1), rng.uniform(0.25, 0.6), rng.uniform(0.4, 2.0)])
+    side = int(rng.integers(4))
+    left, right = space.sides()[side]
+    along = (right - left) / np.linalg.norm(right - left)
+    inward = np.array([along[1], -along[0], 0.0])
+    place = left + (right - left) * rng.uniform(0.08, 0.92)
+    yaw = float(np.arctan2(along[1], along[0]))
+    away = size[1] / 2 + 0.03
+    if rng.random() < 0.4:  # stands free and askew
+        away = rng.uniform(0.5, 1.2)
+        yaw += rng.uniform(-0.7, 0.7)
+    centre = place + inward * away
+    return size, centre, yaw, (along, inward)
+
+
 def furniture(
     rng: np.random.Generator,
     space: Space,
@@ -229,7 +246,7 @@ def furniture(
     """Return up to ``count`` boxes along the walls of a space, none nearer than CLEARANCE_M to the path (N, 2).
 
     ``occupied`` are circles, (3,) and radius in m, where something stands already. ``became`` says what happened to
-    each by number; only light ones are moved, and only where nothing is in the way.
+    each by number; only light ones are moved, and only where the way stays clear and no wall is touched.
     """
     panels: list[Panel] = []
     prints_on_floor: list[Footprint] = []
@@ -241,18 +258,7 @@ def furniture(
     for _ in range(12 * count):
         if len(taken) == count + len(occupied):
             break
-        size = np.array([rng.uniform(0.3, 1.1), rng.uniform(0.25, 0.6), rng.uniform(0.4, 2.0)])
-        side = int(rng.integers(4))
-        left, right = space.sides()[side]
-        along = (right - left) / np.linalg.norm(right - left)
-        inward = np.array([along[1], -along[0], 0.0])
-        place = left + (right - left) * rng.uniform(0.08, 0.92)
-        yaw = float(np.arctan2(along[1], along[0]))
-        away = size[1] / 2 + 0.03
-        if rng.random() < 0.4:  # stands free and askew
-            away = rng.uniform(0.5, 1.2)
-            yaw += rng.uniform(-0.7, 0.7)
-        centre = place + inward * away
+        size, centre, yaw, axes = _somewhere(rng, space)
         radius = 0.5 * float(np.hypot(size[0], size[1]))
         if not fits(centre, radius) or any(
             np.linalg.norm(centre - other) < 0.8 * (radius + reach) for other, reach in taken
@@ -261,7 +267,7 @@ def furniture(
         change = became(len(taken)) if size[2] < LIGHT_M else UNCHANGED
         taken.append((centre, radius))
         images = _box_pictures(rng, size)
-        moved_to = centre + change.along_m * along + abs(change.across_m) * inward
+        moved_to = centre + change.along_m * axes[0] + abs(change.across_m) * axes[1]
         if not change.present:
             continue
         if fits(moved_to, radius) and space.holds(moved_to, radius):

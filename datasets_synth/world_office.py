@@ -81,7 +81,9 @@ def _room(rng: np.random.Generator) -> list[Panel]:
     panels += [*boxes, *desk, *floor_plan.floor_and_ceiling(rng, room, doors, [*footprints, under], FINISH)]
     corner = np.array([-1.3, DEPTH_M - 0.01, 2.3])
     glass = Panel(corner, np.array([2.4, 0, 0]), np.array([0, 0, -1.3]), _window(rng), 0.9, True)
-    return [*panels, glass, _lamp_panel(0.0, DEPTH_M / 2)]
+    image = fittings.whiteboard(rng, int(0.9 * PIXELS_PER_METRE), int(1.4 * PIXELS_PER_METRE))
+    board = Panel(np.array([0.2, 0.012, 1.95]), np.array([-1.4, 0, 0]), np.array([0, 0, -0.9]), image, gloss=0.9)
+    return [*panels, glass, board, _lamp_panel(0.0, DEPTH_M / 2)]
 
 
 def _printed_box(rng: np.random.Generator, centre: Vector, size: Vector, yaw: float = 0.0) -> list[Panel]:

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from seamark.datasets_synth import floor_plan, prints
+from seamark.datasets_synth import floor_plan, plain, prints
 from seamark.datasets_synth.clutter import change
 from seamark.datasets_synth.floor_plan import WALL_PIXELS_PER_METRE, Space
 from seamark.datasets_synth.panels import Panel, moved
@@ -21,8 +21,9 @@ OUTER_M, INNER_M = 6.4, 3.6  # from the middle of the world to the walls of the 
 PASSAGE_M = 2.6
 HEIGHT_M = 2.6
 EYE_M = 1.3
-DIFFERENT_POSTERS = 3  # per long wall
+DIFFERENT_POSTERS = 2  # per long wall
 FURNITURE = 6
+FINISH = floor_plan.Finish(painted=0.35, linoleum=0.3, gaps_m=(0.2, 0.9))  # much to mistake for the same
 
 
 def _spaces() -> tuple[Space, Space, Space]:
@@ -49,7 +50,8 @@ def _with_other_posters(rng: np.random.Generator, panel: Panel) -> Panel:
         row = int((HEIGHT_M - rng.uniform(1.5, 2.1)) * WALL_PIXELS_PER_METRE)
         column = int(min(place * length, length - 1.0) * WALL_PIXELS_PER_METRE)
         target = image[row : row + height, column : column + width]
-        target[:] = prints.poster(rng, height, width)[: target.shape[0], : target.shape[1]]
+        picture = plain.muted(prints.poster(rng, height, width), floor_plan.SATURATION)
+        target[:] = picture[: target.shape[0], : target.shape[1]]
     return replace(panel, image=image)
 
 
@@ -59,9 +61,9 @@ def build_twins(_: str, seed: int, run: int = 0) -> World:
     middle = (OUTER_M + INNER_M) / 2
     rng = np.random.default_rng([seed, 0x7214])
     along = np.column_stack([np.linspace(-HALF_LENGTH_M, HALF_LENGTH_M, 200), np.full(200, middle)])
-    walls = floor_plan.walls(rng, corridor, [east, west])
+    walls = floor_plan.walls(rng, corridor, [east, west], FINISH)
     rest, footprints = floor_plan.furniture(rng, corridor, along, FURNITURE, partial(change, seed, run, 2))
-    rest += floor_plan.floor_and_ceiling(rng, corridor, [east, west], footprints)
+    rest += floor_plan.floor_and_ceiling(rng, corridor, [east, west], footprints, FINISH)
     glowing, lights = floor_plan.lamps(rng, corridor)
     rest += glowing
     panels, nowhere = [*walls, *rest], np.zeros(3)
