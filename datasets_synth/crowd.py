@@ -28,6 +28,7 @@ CAMERA_M = 0.62  # from the camera
 FASTEST_M_S = 2.2
 MASK = (160, 120)
 NEAR_M, WIDEST = 0.1, 1.25  # what is nearer, or farther aside in terms of its depth, is out of the picture
+SPARSELY = 6  # looks of which one is taken to refuse by
 STEP = 3  # frames from one look at the picture to the next
 UNSEEN, POPPING = 0.003, 0.02  # shares of the picture below which nobody is missed, and may appear at a distance
 OUTLINE = 0.94  # of what coarse outlines cover is hidden
@@ -127,6 +128,10 @@ class Planner:
         if not self._possible(met, position[:, frames], present[:, frames]):
             return None
         looks = np.flatnonzero(frames % STEP == 0)
+        few = looks[::SPARSELY]
+        alone = OUTLINE * self._outlines(met.position[few], frames[few], body).mean(axis=(1, 2))
+        if alone.max(initial=0) > MOST_OVER * self._share:  # most are refused here, at a fraction of the cost
+            return None
         masks = self._outlines(met.position[looks], frames[looks], body)
         own = masks.mean(axis=(1, 2))
         core = int(np.searchsorted(looks, met.core - met.first))

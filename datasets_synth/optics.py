@@ -28,6 +28,7 @@ EXPOSURES = (LEAST_EXPOSURE, 12.0)
 LONGEST_SHUTTER = 3.0  # times the shutter of an exposure of one; beyond that the gain grows
 BLUR_TAPS = 8
 LEAST_BLUR_PX = 0.7
+LEAST_KNOWN = 0.05  # share of the shutter time in which what lies behind is seen
 BEHIND_M = 0.05
 
 
@@ -176,12 +177,7 @@ def moving_motion(
         rows, columns = np.nonzero(labels == number)
         at = columns.astype(np.float32), rows.astype(np.float32)
         seeds[rows, columns] = _motion_at(camera, *at, depth[rows, columns], parts[number])
-    _, nearest = cv2.distanceTransformWithLabels(
-        np.where(mask, 0, 255).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    by_number = np.zeros((int(nearest.max()) + 1, 2), np.float32)
-    by_number[nearest[mask]] = seeds[mask]
-    return by_number[nearest], mask
+    return _nearest_known(seeds, mask), mask
 
 
 def blur(picture: Colour, motion: Motion) -> Colour:
@@ -196,7 +192,7 @@ def blur_moving(picture: Colour, motion: Motion, moving: Motion, mask: NDArray[n
     """Return the picture with what moves by itself, ``mask`` (H, W), smeared along ``moving`` over the rest.
 
     Both layers are blurred along their own motion (H, W, 2) px, and what moves covers the rest for the share of the
-    time that it is there; the rest has nothing of it mixed in.
+    time that it is there; the rest has nothing of it mixed in, and goes on behind it as it is at its edge.
     """
     longest, longest_moving = _longest(motion[::8, ::8]), _longest(moving[mask][::16])
     if max(longest, longest_moving) < LEAST_BLUR_PX:
@@ -206,9 +202,22 @@ def blur_moving(picture: Colour, motion: Motion, moving: Motion, mask: NDArray[n
     behind = _smeared(np.concatenate([picture * outside, outside], axis=-1), motion, longest)
     in_front = _smeared(np.concatenate([picture * inside, inside], axis=-1), moving, longest_moving)
     known = behind[..., 3:]
-    rest = np.where(known > 1e-3, behind[..., :3] / np.maximum(known, np.float32(1e-3)), picture)
+    rest = np.where(known > LEAST_KNOWN, behind[..., :3] / np.maximum(known, np.float32(LEAST_KNOWN)), picture)
+    rest[mask] = _nearest_known(rest, known[..., 0] > LEAST_KNOWN)[mask]
     blurred: Colour = in_front[..., :3] + (1 - in_front[..., 3:]) * rest
     return blurred
+
+
+def _nearest_known(values: Colour, known: NDArray[np.bool_]) -> Colour:
+    """Return values (H, W, C) with what is not known taken from the nearest pixel that is."""
+    if not known.any():
+        return values
+    hidden = np.where(known, 0, 255).astype(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    by_number = np.zeros((int(nearest.max()) + 1, values.shape[2]), np.float32)
+    by_number[nearest[known]] = values[known]
+    filled: Colour = by_number[nearest]
+    return filled
 
 
 def _longest(motion: Motion) -> float:

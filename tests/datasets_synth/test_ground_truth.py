@@ -95,6 +95,27 @@ def test_unknown_depth_has_no_flow() -> None:
         flow(depth[:5], camera, np.eye(4), np.eye(4))
 
 
+def test_what_moves_by_itself_has_its_own_flow() -> None:
+    """A thing 2 m ahead that steps 0.1 m to the right, seen by a camera that steps 0.3 m: it moves by -fx 0.2 / 2."""
+    camera = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+    depth, labels = np.full((120, 160), 4.0), np.ones((120, 160), np.uint8)
+    depth[40:80, 60:100], labels[40:80, 60:100] = 2.0, 34
+    labels[40:80, 90:100] = 42
+    T_a, T_b = look(EYE, 0.7), look(EYE, 0.7) @ se3.make(np.eye(3), np.array([0.3, 0, 0]))
+    step = T_a @ se3.make(np.eye(3), np.array([0.1, 0, 0])) @ se3.inverse(T_a)
+    moved = flow(depth, camera, T_a, T_b, labels, {34: step})
+    assert np.allclose(moved[40:80, 60:90, 0], -130 * 0.2 / 2, atol=1e-3)
+    assert np.allclose(moved[:40, :, 0], -130 * 0.3 / 4, atol=1e-3)
+    assert np.isnan(moved[40:80, 90:100]).all() and np.isnan(moved).sum() == 40 * 10 * 2
+    assert np.allclose(flow(depth, camera, T_a, T_b)[40:80, 60:100, 0], -130 * 0.3 / 2, atol=1e-3)
+    turning = se3.make(se3.exp_rotation(np.array([0.1, 0.0, 0.3])), np.array([0.2, -0.1, 0.05]))
+    point = se3.transform(turning, se3.transform(T_a, camera.rays(np.array([[70.0, 50.0]])) * 2.0))
+    expected = camera.project(se3.transform(se3.inverse(T_b), point))[0] - (70, 50)
+    assert np.allclose(flow(depth, camera, T_a, T_b, labels, {34: turning})[50, 70], expected, atol=1e-3)
+    with pytest.raises(SeamarkError, match="labels are"):
+        flow(depth, camera, T_a, T_b, labels[:5])
+
+
 def test_place_truth_is_not_distance(world: ToyWorld) -> None:
     """The same spot seen in opposite directions is near and shares nothing; a step ahead shares nearly all."""
     poses = [T_A, T_B, look(EYE, 0.4 + np.pi), look(EYE + np.array([0.3, 0.13, 0]), 0.4), look(-EYE * (1, 1, -1), 0.4)]

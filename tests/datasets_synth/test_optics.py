@@ -127,3 +127,72 @@ class TestBlur:
     def test_a_camera_at_rest_gives_sharp_pictures(self) -> None:
         picture = cv2.randu(np.zeros((40, 80, 3), np.float32), 0, 255)
         assert optics.blur(picture, np.zeros((40, 80, 2), np.float32)) is picture
+
+
+def _waves(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A picture that is known between pixels too."""
+    total = np.full((*x.shape, 3), 120.0)
+    for _ in range(12):
+        f, phase = rng.uniform(-0.35, 0.35, 2), rng.uniform(0, 6, 3)
+        total += 18 * np.sin((f[0] * x + f[1] * y)[..., None] + phase)
+    return total
+
+
+class TestBlurOfWhatMoves:
+    """A square that moves by (10, 4) px before a picture that moves by (-5, 0)."""
+
+    SQUARE, REST = np.array([10.0, 4.0]), np.array([-5.0, 0.0])
+
+    def _scene(self, share: float) -> tuple[np.ndarray, np.ndarray]:
+        y, x = np.mgrid[0:90, 0:120].astype(np.float64)
+        own_x, own_y = x - share * self.SQUARE[0], y - share * self.SQUARE[1]
+        mask = (np.abs(own_x - 60) < 20.5) & (np.abs(own_y - 45) < 20.5)
+        behind = _waves(np.random.default_rng(0), x - share * self.REST[0], y - share * self.REST[1])
+        square = 40 + _waves(np.random.default_rng(1), own_x, own_y)
+        return np.where(mask[..., None], square, behind).astype(np.float32), mask
+
+    def test_it_is_the_mean_over_the_time_that_the_shutter_is_open(self) -> None:
+        exact = np.mean([self._scene(share)[0] for share in (np.arange(64) + 0.5) / 64 - 0.5], axis=0)
+        picture, mask = self._scene(0.0)
+        motion = np.broadcast_to(self.REST.astype(np.float32), (90, 120, 2))
+        moving = np.broadcast_to(self.SQUARE.astype(np.float32), (90, 120, 2))
+        right = np.abs(optics.blur_moving(picture, motion, moving, mask) - exact).mean(axis=2)
+        as_if_still = np.abs(optics.blur(picture, motion) - exact).mean(axis=2)
+        inside = cv2.erode(mask.astype(np.uint8), np.ones((13, 13))) > 0
+        about = (cv2.dilate(mask.astype(np.uint8), np.ones((15, 15))) > 0) & ~mask
+        assert 0 < right[inside].mean() < 0.15 * as_if_still[inside].mean()
+        assert 0 < right[about].mean() < 0.5 * as_if_still[about].mean()
+        edge = mask & ~inside  # what lies behind is not in the picture there
+        assert right[edge].mean() < 0.7 * as_if_still[edge].mean()
+
+    def test_its_edge_is_as_wide_as_its_own_motion(self) -> None:
+        mask = np.zeros((60, 120), np.bool_)
+        mask[20:40, 40:80] = True
+        picture = np.where(mask[..., None], np.float32(200), np.float32(0)) * np.ones(3, np.float32)
+        moving = np.zeros((60, 120, 2), np.float32)
+        moving[..., 0] = 8
+        blurred = optics.blur_moving(picture, np.zeros_like(moving), moving, mask)[..., 0]
+        ramp = (blurred[30] > 10) & (blurred[30] < 190)
+        assert 6 <= ramp[30:50].sum() <= 9 and 6 <= ramp[70:90].sum() <= 9
+        assert ((blurred[:, 60] > 10) & (blurred[:, 60] < 190)).sum() == 0  # no motion across
+        assert blurred[30].sum() == pytest.approx(picture[30, :, 0].sum(), rel=1e-3)
+
+    def test_motion_of_moving_pixels_is_reprojection_of_their_own_motion(self) -> None:
+        camera = TestBlur.CAMERA
+        depth = np.random.default_rng(2).uniform(1.5, 4.0, (120, 160)).astype(np.float32)
+        labels = np.ones((120, 160), np.uint8)
+        labels[30:60, 40:70], labels[30:60, 70:90] = 32, 33
+        parts = {
+            32: se3.make(se3.exp_rotation(np.array([0.0, 0.04, 0.01])), np.array([0.1, 0.0, -0.1])),
+            33: se3.make(np.eye(3), np.array([-0.05, 0.02, 0.0])),
+        }
+        found = optics.moving_motion(camera, depth, labels, parts)
+        assert found is not None
+        motion, mask = found
+        assert np.array_equal(mask, labels > 1)
+        for row, column in ((31, 41), (50, 65), (40, 80)):
+            point = camera.rays(np.array([[column, row]], np.float64)) * float(depth[row, column])
+            later = camera.project(se3.transform(parts[int(labels[row, column])], point))[0]
+            assert np.allclose(motion[row, column], later - (column, row), atol=0.01)
+        assert np.allclose(motion[20, 60], motion[30, 60], atol=1e-6)  # goes on about the edge
+        assert optics.moving_motion(camera, depth, np.ones_like(labels), parts) is None
