@@ -39,7 +39,7 @@ def test_depth_and_poses_predict_where_points_are_seen(sequence: SynthSequence) 
     frames = list(sequence.frames())
     for first, second in ((0, 3), (100, 103), (4, 212)):
         errors = reprojection_errors(sequence, frames[first], frames[second])
-        assert len(errors) > 100
+        assert len(errors) > 50
         assert np.median(np.linalg.norm(errors, axis=1)) < 0.7
         assert np.all(np.abs(np.median(errors, axis=0)) < 0.2)
 
