@@ -45,6 +45,19 @@ class People:
         return out
 
 
+def table(people: People, stamps_ns: NDArray[np.int64]) -> str:
+    """Return where everybody is as CSV: a row per frame and part, with T_world_part as translation and quaternion."""
+    rows = ["#stamp_ns,frame,person,label,part,tx,ty,tz,qx,qy,qz,qw"]
+    for index, stamp in enumerate(stamps_ns.tolist()):
+        for person in range(len(people.figures)):
+            poses = people.poses(person, index)
+            for part, T in enumerate(() if poses is None else poses):
+                numbers = ",".join(f"{number:.9f}" for number in (*T[:3, 3], *se3.to_quaternion(T[:3, :3])))
+                marked = figures.label(person, part)
+                rows.append(f"{stamp},{index},{person},{marked},{figures.PARTS[part]},{numbers}")
+    return "\n".join(rows) + "\n"
+
+
 def people_of(specification: Specification, panels: Sequence[Panel] | None = None) -> People:
     """Return the people of a sequence, drawn from the seed of its motion.
 

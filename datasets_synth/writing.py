@@ -18,6 +18,7 @@ from seamark.datasets_synth import (
     folder,
     layouts,
     motion_sensors,
+    people,
     scenarios,
     sensor,
     specification,
@@ -59,7 +60,7 @@ class Written:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A sequence that has not been made yet; ``coded`` yields its frames from an index on."""
+    """A sequence that has not been made yet: ``coded`` yields its frames from an index on, ``people`` their table."""
 
     name: str
     mode: Mode
@@ -70,6 +71,7 @@ class _Plan:
     breaks: list[int]
     coded: Callable[[int], Iterator[CodedFrame]]
     digest: str
+    people: Callable[[], str] = str
 
     def recording(self) -> Recording:
         """Return the readings of all sensors but the cameras."""
@@ -111,6 +113,8 @@ def write_sequence(
                 if progress is not None:
                     progress(coded.index + 1, total)
             layout.finish(partial, plan.recording())
+            if walking := plan.people():
+                _put(partial / "labels" / "people.csv", walking.encode())
             (partial / LOCK).unlink()
             partial.rename(target)
             (target / COUNT).unlink()
@@ -192,6 +196,9 @@ def _plan_world(text: str, cache_dir: Path | None) -> _Plan:
         with RenderPool(wanted, begin) as pool:
             yield from pool.frames()
 
+    def walking() -> str:
+        return people.table(people.people_of(wanted), truth.stamps_ns) if wanted.labels else ""
+
     return _Plan(
         name=_canonical(wanted, wanted.world),
         mode=wanted.mode,
@@ -202,6 +209,7 @@ def _plan_world(text: str, cache_dir: Path | None) -> _Plan:
         breaks=_breaks(wanted.trajectory, wanted.route, truth),
         coded=coded,
         digest=specification.content_hash(wanted),
+        people=walking,
     )
 
 

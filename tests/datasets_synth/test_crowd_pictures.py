@@ -79,15 +79,3 @@ def test_a_frame_of_a_crowd_does_not_depend_on_those_before() -> None:
     last = list(render_some(wanted, [2, 5, 9]))[-1]
     assert alone == last
     assert len(alone.right) > 1000
-
-
-def test_the_right_eye_is_blurred_by_what_it_sees_itself() -> None:
-    """The right picture is that of a single camera 12 cm further right, whose motion and depth are its own."""
-    text = "loop,trajectory=hand_held,image=320x240,frames=120,camera=real,condition=dusk,sensors="
-    both = _rendered(specification.parse(text + "stereo"), (60, 80, 100))
-    alone = _rendered(specification.parse(text + "mono,offset=-12"), (60, 80, 100))
-    for (pair, _), (single, _) in zip(both, alone, strict=True):
-        assert pair.image_right is not None
-        difference = np.abs(cv2.blur(pair.image_right, (3, 3)).astype(float) - cv2.blur(single.image, (3, 3)))
-        assert np.median(difference) < 3
-        assert np.percentile(difference, 99) < 12

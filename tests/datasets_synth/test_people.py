@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from seamark.datasets_synth import figures, people, specification
+from seamark.datasets_synth import figures, optics, people, sensor, specification, studio
 from seamark.datasets_synth.clearance import nearest_surface
 from seamark.datasets_synth.crowd import FreeSpace, Planner
 from seamark.datasets_synth.panels import Panel
 from seamark.datasets_synth.people import People
+from seamark.datasets_synth.renderer import View
 from seamark.datasets_synth.world import World
 from seamark.frontend import se3
+from seamark.frontend.camera import Rig
 
 FPS = specification.FPS
+OPEN_FRAMES = optics.MODELS["real"].shutter_s * optics.LONGEST_SHUTTER * FPS
 WANTED = specification.parse("loop,trajectory=loop,frames=300,image=320x240,crowd=40,seed=6")
 
 
@@ -137,3 +140,62 @@ class TestMotion:
                 faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
                 towards = np.einsum("ni,ni->n", faces, mesh.normals[mesh.triangles].mean(axis=1))
                 assert np.mean(towards > 0) > 0.9
+
+    def test_the_table_has_every_part_at_every_frame(self, crowd: People) -> None:
+        rows = [line.split(",") for line in people.table(crowd, np.arange(WANTED.frames) * 10).splitlines()[1:]]
+        assert len(rows) == len(figures.PARTS) * sum(int(track.present.sum()) for track in crowd.tracks)
+        stamp, frame, person, label, part, *numbers = rows[len(rows) // 2]
+        poses = crowd.poses(int(person), int(frame))
+        assert poses is not None
+        T = poses[figures.PARTS.index(part)]
+        assert (int(stamp), int(label)) == (10 * int(frame), figures.label(int(person), figures.PARTS.index(part)))
+        values = np.array(numbers, np.float64)
+        assert np.allclose(values[:3], T[:3, 3], atol=1e-6)
+        assert np.allclose(se3.from_quaternion(values[3:]), T[:3, :3], atol=1e-6)
+
+
+class _FlatView:
+    """Stands in for the renderer: a bright line, near for the right eye and far for the left."""
+
+    NEAR_M, FAR_M, COLUMN = 0.8, 12.0, 290
+
+    def __init__(self, world: World, rig: Rig, movers: object, *, meter: bool) -> None:
+        self.shape = (rig.cam0.height, rig.cam0.width)
+
+    def meter(self, _: np.ndarray) -> np.ndarray:
+        return np.full((24, 32, 3), 60, np.float32)  # dark, so that the shutter is open for long
+
+    def illuminate(self, _: object) -> None:
+        return
+
+    def render(self, _: np.ndarray, **wanted: object) -> View:
+        assert wanted["right_depth"] is True
+        line = np.full((*self.shape, 3), 30, np.float32)
+        line[:, self.COLUMN] = 230
+        left, right = (np.full(self.shape, depth, np.float32) for depth in (self.FAR_M, self.NEAR_M))
+        return View(line, left, line.copy(), None, right)
+
+
+def test_the_right_eye_is_blurred_by_what_it_sees_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line as wide in each eye as a point at its own depth moves while the shutter is open."""
+    monkeypatch.setattr(studio, "Renderer", _FlatView)
+    wanted = specification.parse("loop,trajectory=loop,image=320x240,frames=780,camera=real,sensors=stereo")
+    index, camera = 90, wanted.rig.cam0
+    frame = sensor.decode(studio.Studio(wanted).frame(index), 0, "")
+    assert frame.image_right is not None
+    poses = wanted.poses()
+    T_later_now = se3.inverse(poses[index + 1]) @ poses[index]
+    moved = []
+    for image, depth, offset in ((frame.image, _FlatView.FAR_M, 0.0), (frame.image_right, _FlatView.NEAR_M, 0.12)):
+        eye = se3.make(np.eye(3), np.array([offset, 0, 0]))
+        T = se3.inverse(eye) @ T_later_now @ eye
+        point = camera.rays(np.array([[_FlatView.COLUMN, 120.0]])) * depth
+        whole = float(camera.project(se3.transform(T, point))[0, 0] - _FlatView.COLUMN)
+        profile = image[110:130].astype(np.float64).mean(axis=(0, 2))
+        light = np.maximum(profile - np.median(profile), 0)[_FlatView.COLUMN - 25 : _FlatView.COLUMN + 26]
+        moved.append((abs(whole) * OPEN_FRAMES, float((light > 0.25 * light.max()).sum())))
+    (far, far_seen), (near, near_seen) = moved
+    assert near > 2 * far
+    assert abs(near_seen - near) < 1.6
+    assert abs(far_seen - max(1.0, far)) < 1.6
+    assert near_seen > far_seen + 2
