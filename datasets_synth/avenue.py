@@ -173,8 +173,8 @@ def tree(rng: np.random.Generator, things: Stock, foot: Vector) -> list[Panel]:
     return panels
 
 
-def car(rng: np.random.Generator, things: Stock, foot: Vector, yaw: float) -> list[Panel]:
-    """Return a parked car: a body, a cabin that shines, and the dark beneath it."""
+def car(rng: np.random.Generator, things: Stock, foot: Vector, yaw: float, *, on_asphalt: bool = True) -> list[Panel]:
+    """Return a parked car: a body, a cabin that shines, and on asphalt the dark beneath it."""
     paint = things.cars[int(rng.integers(len(things.cars)))]
     length, high = rng.uniform(3.8, 4.5), rng.uniform(0.72, 0.85)
     body = box_faces(foot + UP * (0.15 + high / 2), np.array([length, 1.7, high]), yaw)
@@ -185,6 +185,8 @@ def car(rng: np.random.Generator, things: Stock, foot: Vector, yaw: float) -> li
     pictures = (paint.cabin_end, paint.cabin_side, paint.cabin_end, paint.cabin_side)
     panels += [Panel(*face, image, gloss=0.8) for face, image in zip(cabin, pictures, strict=False)]
     panels += [Panel(*face, paint.top, gloss=0.5) for face in (body[4], cabin[4])]
+    if not on_asphalt:
+        return panels
     shadow = box_faces(foot + UP * 0.01, np.array([length + 0.9, 2.5, 0.02]), yaw)[4]
     return [*panels, Panel(*shadow, things.under)]
 

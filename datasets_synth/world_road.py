@@ -76,7 +76,7 @@ def _roadside(rng: np.random.Generator, things: Stock, points: np.ndarray) -> tu
             elif kind < 0.7:
                 panels += avenue.sign(rng, things, place, yaw + np.pi + rng.normal(0, 0.2))
             elif kind < 0.8:
-                panels += avenue.car(rng, things, place, yaw + rng.normal(0, 0.6))
+                panels += avenue.car(rng, things, place, yaw + rng.normal(0, 0.6), on_asphalt=False)
         for s in np.arange(15.0, length, 24.0) + 12 * (side > 0):
             size = (float(rng.uniform(6, 9)), float(rng.uniform(7, 12)), float(rng.uniform(4, 9)))
             front, yaw = _along(points, float(s), side * (half + float(rng.uniform(7, 12))))
