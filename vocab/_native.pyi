@@ -34,6 +34,7 @@ class Postings:
         self,
         n_words: int,
         code_weights: NDArray[np.float32],
+        code_shares: NDArray[np.float32],
         block_places: int = 65536,
         with_signatures: bool = False,
         with_geometry: bool = False,
@@ -43,23 +44,26 @@ class Postings:
         self,
         words: NDArray[np.int32],
         codes: NDArray[np.uint8],
-        scale: float,
+        mass: float,
         signatures: NDArray[np.uint64] | None = None,
         geometry: NDArray[np.uint16] | None = None,
     ) -> int: ...
     def remove(self, slot: int) -> bool: ...
     def compact(self) -> NDArray[np.int32]: ...
-    def votes(self, words: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]: ...
+    def votes(
+        self, words: NDArray[np.int32], weights: NDArray[np.float32], most: NDArray[np.float32], mass: float
+    ) -> NDArray[np.float32]: ...
     def near_votes(
         self,
         words: NDArray[np.int32],
         weights: NDArray[np.float32],
+        mass: float,
         signatures: NDArray[np.uint64],
         table: NDArray[np.float32],
         geometry: NDArray[np.uint16] | None = None,
     ) -> NDArray[np.float32]: ...
     def snapshot(self) -> tuple[list[_Block], NDArray[np.float32], NDArray[np.uint8]]: ...
-    def attach(self, blocks: list[_Block], scales: NDArray[np.float32], live: NDArray[np.uint8]) -> None: ...
+    def attach(self, blocks: list[_Block], masses: NDArray[np.float32], live: NDArray[np.uint8]) -> None: ...
     @property
     def n_slots(self) -> int: ...
     @property

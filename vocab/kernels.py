@@ -6,8 +6,8 @@ try:
     from seamark.vocab import _native as native
 except ImportError as error:
     raise KernelsMissingError(
-        f"the compiled part of Seamark is missing or does not fit this Python ({error}); run `make setup` in a checkout, "
-        "or install the wheel"
+        f"the compiled part of Seamark is missing or does not fit this Python ({error}): "
+        "run `make setup` in a checkout, or install the wheel"
     ) from error
 
 __all__ = ["native"]

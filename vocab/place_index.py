@@ -15,6 +15,7 @@ from seamark.vocab.vocabulary import Vocabulary, check_descriptors
 
 NANOSECONDS = 1_000_000_000
 NO_PLACE = -1
+COMPACT_FROM = 64  # removed places; fewer are kept, however few others there are
 
 
 class PlaceIndex:
@@ -84,6 +85,12 @@ class PlaceIndex:
         self._inverted.remove(slot)
         self._table[slot]["id"] = NO_PLACE
         self._table[slot]["live"] = False
+        if self._inverted.n_slots > 2 * len(self._slot_of) + COMPACT_FROM:
+            self._compact()
+
+    def _compact(self) -> None:
+        self._table = self._table[self._inverted.compact()]
+        self._slot_of = {int(place_id): slot for slot, place_id in enumerate(self._table["id"])}
 
     def _refuse_known(self, place_id: int) -> None:
         if place_id in self._slot_of:

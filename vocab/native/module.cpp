@@ -96,7 +96,7 @@ const T* column(const std::optional<In<T>>& array, bool wanted, size_t n, const 
     return wanted ? array->data() : nullptr;
 }
 
-int64_t add(Postings& postings, const In<int32_t>& words, const In<uint8_t>& codes, float scale,
+int64_t add(Postings& postings, const In<int32_t>& words, const In<uint8_t>& codes, float mass,
             const std::optional<In<uint64_t>>& signatures, const std::optional<In<uint16_t>>& geometry) {
     const size_t n = words.shape(0);
     require_words(words, postings.n_words());
@@ -106,7 +106,7 @@ int64_t add(Postings& postings, const In<int32_t>& words, const In<uint8_t>& cod
                           column(geometry, postings.with_geometry(), n, "geometry as the index has it"),
                           static_cast<int64_t>(n)};
     nb::gil_scoped_release free;
-    return postings.add(place, scale);
+    return postings.add(place, mass);
 }
 
 Out<float, nb::ndim<1>> give_scores(Scores scores) {
@@ -116,10 +116,12 @@ Out<float, nb::ndim<1>> give_scores(Scores scores) {
     return Out<float, nb::ndim<1>>(values, {n}, owner);
 }
 
-Out<float, nb::ndim<1>> votes(const Postings& postings, const In<int32_t>& words, const In<float>& weights) {
+Out<float, nb::ndim<1>> votes(const Postings& postings, const In<int32_t>& words, const In<float>& weights,
+                              const In<float>& most, float mass) {
+    const size_t n = words.shape(0);
     require_words(words, postings.n_words());
-    require(weights.shape(0) == words.shape(0), "each word needs a weight");
-    const QueryView query{words.data(), weights.data(), nullptr, nullptr, static_cast<int64_t>(words.shape(0))};
+    require(weights.shape(0) == n && most.shape(0) == n, "each word needs a weight and a most");
+    const QueryView query{words.data(), weights.data(), most.data(), mass, nullptr, nullptr, static_cast<int64_t>(n)};
     Scores scores;
     {
         nb::gil_scoped_release free;
@@ -129,7 +131,7 @@ Out<float, nb::ndim<1>> votes(const Postings& postings, const In<int32_t>& words
 }
 
 Out<float, nb::ndim<1>> near_votes(const Postings& postings, const In<int32_t>& words, const In<float>& weights,
-                                   const In<uint64_t>& signatures, const In<float>& table,
+                                   float mass, const In<uint64_t>& signatures, const In<float>& table,
                                    const std::optional<In<uint16_t>>& geometry) {
     const size_t n = words.shape(0);
     require_words(words, postings.n_words());
@@ -139,7 +141,7 @@ Out<float, nb::ndim<1>> near_votes(const Postings& postings, const In<int32_t>& 
     require(!geometry || postings.with_geometry(), "the index has no geometry");
     int limit = kDistances - 1;
     while (limit >= 0 && table.data()[limit] == 0.0f) --limit;
-    const QueryView query{words.data(), weights.data(), signatures.data(),
+    const QueryView query{words.data(), weights.data(), nullptr, mass, signatures.data(),
                           column(geometry, geometry.has_value(), n, "each word needs geometry"),
                           static_cast<int64_t>(n)};
     Scores scores;
@@ -172,8 +174,8 @@ nb::tuple snapshot(const Postings& postings) {
                                      view(block.ids, n, block.owner), view(block.codes, n - n_plain, block.owner),
                                      view(block.signatures, n, block.owner), view(block.geometry, n, block.owner)));
     }
-    const size_t n_slots = now.scales.size();
-    return nb::make_tuple(blocks, give<float, nb::ndim<1>>(std::move(now.scales), {n_slots}),
+    const size_t n_slots = now.masses.size();
+    return nb::make_tuple(blocks, give<float, nb::ndim<1>>(std::move(now.masses), {n_slots}),
                           give<uint8_t, nb::ndim<1>>(std::move(now.live), {n_slots}));
 }
 
@@ -204,29 +206,31 @@ Block attached(const BlockIn& in, const Postings& postings) {
     return block;
 }
 
-void attach(Postings& postings, const std::vector<BlockIn>& blocks, const In<float>& scales, const In<uint8_t>& live) {
+void attach(Postings& postings, const std::vector<BlockIn>& blocks, const In<float>& masses, const In<uint8_t>& live) {
     Snapshot snapshot;
-    snapshot.scales.assign(scales.data(), scales.data() + scales.shape(0));
+    snapshot.masses.assign(masses.data(), masses.data() + masses.shape(0));
     for (size_t slot = 0; slot < live.shape(0); ++slot) snapshot.live.push_back(live.data()[slot] != 0);
     int64_t n_places = 0;
     for (const BlockIn& block : blocks) {
         snapshot.blocks.push_back(attached(block, postings));
         n_places += snapshot.blocks.back().n_places;
     }
-    require(n_places == static_cast<int64_t>(scales.shape(0)) && scales.shape(0) == live.shape(0),
-            "each place needs a scale");
+    require(n_places == static_cast<int64_t>(masses.shape(0)) && masses.shape(0) == live.shape(0),
+            "each place needs a mass");
     nb::gil_scoped_release free;
     postings.attach(std::move(snapshot));
 }
 
-Postings* make_postings(int64_t n_words, const In<float>& code_weights, int64_t block_places, bool with_signatures,
-                        bool with_geometry, const std::optional<std::string>& level) {
+Postings* make_postings(int64_t n_words, const In<float>& code_weights, const In<float>& code_shares,
+                        int64_t block_places, bool with_signatures, bool with_geometry,
+                        const std::optional<std::string>& level) {
     require(n_words >= 1 && n_words < (int64_t{1} << 30), "an index needs words");
-    require(code_weights.shape(0) == kCodes, "the table must have a weight for each of 256 codes");
+    require(code_weights.shape(0) == kCodes && code_shares.shape(0) == kCodes, "256 codes need weights and shares");
     require(block_places >= 1 && block_places <= kMostPlaces, "a block holds 1 to 65536 places");
-    std::array<float, kCodes> weights;
+    std::array<float, kCodes> weights, shares;
     std::copy_n(code_weights.data(), kCodes, weights.begin());
-    return new Postings(n_words, block_places, with_signatures, with_geometry, weights, kernels_named(level));
+    std::copy_n(code_shares.data(), kCodes, shares.begin());
+    return new Postings(n_words, block_places, with_signatures, with_geometry, weights, shares, kernels_named(level));
 }
 
 }  // namespace
@@ -248,9 +252,9 @@ NB_MODULE(_native, m) {
         .def("assign", &assign, "descriptors"_a, "k"_a = 1, "beam"_a = 1);
 
     nb::class_<Postings>(m, "Postings")
-        .def(nb::new_(&make_postings), "n_words"_a, "code_weights"_a, "block_places"_a = kMostPlaces,
+        .def(nb::new_(&make_postings), "n_words"_a, "code_weights"_a, "code_shares"_a, "block_places"_a = kMostPlaces,
              "with_signatures"_a = false, "with_geometry"_a = false, "level"_a = nb::none())
-        .def("add", &add, "words"_a, "codes"_a, "scale"_a, "signatures"_a = nb::none(), "geometry"_a = nb::none())
+        .def("add", &add, "words"_a, "codes"_a, "mass"_a, "signatures"_a = nb::none(), "geometry"_a = nb::none())
         .def("remove", &Postings::remove, "slot"_a, nb::call_guard<nb::gil_scoped_release>())
         .def("compact",
              [](Postings& self) {
@@ -262,10 +266,10 @@ NB_MODULE(_native, m) {
                  const size_t n = kept.size();
                  return give<int32_t, nb::ndim<1>>(std::move(kept), {n});
              })
-        .def("votes", &votes, "words"_a, "weights"_a)
-        .def("near_votes", &near_votes, "words"_a, "weights"_a, "signatures"_a, "table"_a, "geometry"_a = nb::none())
+        .def("votes", &votes, "words"_a, "weights"_a, "most"_a, "mass"_a)
+        .def("near_votes", &near_votes, "words"_a, "weights"_a, "mass"_a, "signatures"_a, "table"_a, "geometry"_a = nb::none())
         .def("snapshot", &snapshot)
-        .def("attach", &attach, "blocks"_a, "scales"_a, "live"_a)
+        .def("attach", &attach, "blocks"_a, "masses"_a, "live"_a)
         .def_prop_ro("n_slots", &Postings::n_slots)
         .def_prop_ro("n_live", &Postings::n_live)
         .def_prop_ro("n_bytes", &Postings::bytes);

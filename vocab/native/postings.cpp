@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstdlib>
+#include <limits>
 #include <new>
 #include <numeric>
 
@@ -41,16 +42,18 @@ Block own(std::shared_ptr<BlockArrays> arrays, int64_t n_places) {
 }
 
 Postings::Postings(int64_t n_words, int64_t block_places, bool with_signatures, bool with_geometry,
-                   const std::array<float, kCodes>& code_weights, const Kernels& kernels)
+                   const std::array<float, kCodes>& code_weights, const std::array<float, kCodes>& code_shares,
+                   const Kernels& kernels)
     : n_words_(n_words),
       block_places_(block_places),
       with_signatures_(with_signatures),
       with_geometry_(with_geometry),
       code_weights_(code_weights),
+      code_shares_(code_shares),
       kernels_(kernels),
       head_(n_words, with_signatures, with_geometry) {}
 
-int64_t Postings::add(const PlaceView& place, float scale) {
+int64_t Postings::add(const PlaceView& place, float mass) {
     const std::lock_guard writing(writer_);
     if (head_.n_places() == block_places_) {
         Block full = freeze_head();  // readers go on meanwhile
@@ -64,10 +67,10 @@ int64_t Postings::add(const PlaceView& place, float scale) {
         sealed_.pop_back();
     }
     head_.add(place);
-    scales_.push_back(scale);
+    masses_.push_back(mass);
     live_.push_back(1);
     ++n_live_;
-    return static_cast<int64_t>(scales_.size()) - 1;
+    return static_cast<int64_t>(masses_.size()) - 1;
 }
 
 bool Postings::remove(int64_t slot) {
@@ -75,7 +78,7 @@ bool Postings::remove(int64_t slot) {
     const std::unique_lock change(state_);
     if (slot < 0 || slot >= static_cast<int64_t>(live_.size()) || !live_[static_cast<size_t>(slot)]) return false;
     live_[static_cast<size_t>(slot)] = 0;
-    scales_[static_cast<size_t>(slot)] = 0;
+    masses_[static_cast<size_t>(slot)] = std::numeric_limits<float>::infinity();
     --n_live_;
     return true;
 }
@@ -83,12 +86,12 @@ bool Postings::remove(int64_t slot) {
 std::vector<int32_t> Postings::compact() {
     const std::lock_guard writing(writer_);
     std::vector<int32_t> kept, rank(live_.size(), -1);
-    std::vector<float> scales;
+    std::vector<float> masses;
     for (size_t slot = 0; slot < live_.size(); ++slot) {
         if (!live_[slot]) continue;
         rank[slot] = static_cast<int32_t>(kept.size());
         kept.push_back(static_cast<int32_t>(slot));
-        scales.push_back(scales_[slot]);
+        masses.push_back(masses_[slot]);
     }
     std::vector<Block> from = sealed_, fresh;
     if (head_.n_places()) from.push_back(freeze_head());
@@ -98,7 +101,7 @@ std::vector<int32_t> Postings::compact() {
     const std::unique_lock change(state_);
     sealed_ = std::move(fresh);
     head_.clear();
-    scales_ = std::move(scales);
+    masses_ = std::move(masses);
     live_.assign(kept.size(), 1);
     return kept;
 }
@@ -180,13 +183,17 @@ Scores Postings::votes(const QueryView& query) const {
     visit_blocks(query, [&](int64_t first, int64_t i, const ListView& list) {
         float* places = scores.values.get() + first;
         if (!list.codes) {
-            const float weight = query.weights[i] * code_weights_[1];
+            const float weight = query.weights[i] * std::min(code_weights_[1], query.most[i]);
             for (int64_t j = 0; j < list.n; ++j) places[list.ids[j]] += weight;
         } else {
-            for (int64_t j = 0; j < list.n; ++j) places[list.ids[j]] += query.weights[i] * code_weights_[list.codes[j]];
+            for (int64_t j = 0; j < list.n; ++j) {
+                const uint8_t code = list.codes[j];
+                const float counted = std::min(code_weights_[code], query.most[i]) * code_shares_[code];
+                places[list.ids[j]] += query.weights[i] * counted;
+            }
         }
     });
-    return finished(std::move(scores));
+    return finished(std::move(scores), query.mass);
 }
 
 Scores Postings::near_votes(const QueryView& query, const float* table, int limit, bool geometric) const {
@@ -203,7 +210,8 @@ Scores Postings::near_votes(const QueryView& query, const float* table, int limi
                                          limit, positions.data(), distances.data());
             for (int64_t j = 0; j < found; ++j) {
                 const int64_t at = from + positions[static_cast<size_t>(j)];
-                const float weight = query.weights[i] * code_weights_[list.codes ? list.codes[at] : 1] *
+                const uint8_t code = list.codes ? list.codes[at] : uint8_t{1};
+                const float weight = query.weights[i] * code_weights_[code] * code_shares_[code] *
                                      table[distances[static_cast<size_t>(j)]];
                 const int64_t slot = first + list.ids[at];
                 if (!geometric) {
@@ -219,26 +227,27 @@ Scores Postings::near_votes(const QueryView& query, const float* table, int limi
             }
         }
     });
-    if (!geometric) return finished(std::move(total));
+    if (!geometric) return finished(std::move(total), query.mass);
     Scores scores = room(1);
     for (int64_t slot = 0; slot < scores.n; ++slot) {
         const float* bins = total.values.get() + slot * kBins;
         scores.values[static_cast<size_t>(slot)] = std::min(*std::max_element(bins, bins + kOrientationBins),
                                                             *std::max_element(bins + kOrientationBins, bins + kBins));
     }
-    return finished(std::move(scores));
+    return finished(std::move(scores), query.mass);
 }
 
 Scores Postings::room(int64_t per_slot) const {
-    const size_t n = scales_.size();
+    const size_t n = masses_.size();
     auto* values = static_cast<float*>(std::calloc((n + kMostPlaces) * static_cast<size_t>(per_slot), sizeof(float)));
     if (!values) throw std::bad_alloc();
     return {std::unique_ptr<float[], Scores::Free>(values), static_cast<int64_t>(n)};
 }
 
-Scores Postings::finished(Scores scores) const {
+Scores Postings::finished(Scores scores, float mass) const {
     float* values = scores.values.get();
-    for (size_t slot = 0; slot < scales_.size(); ++slot) values[slot] *= scales_[slot];
+    mass = std::max(mass, std::numeric_limits<float>::min());
+    for (size_t slot = 0; slot < masses_.size(); ++slot) values[slot] /= std::max(mass, masses_[slot]);
     return scores;
 }
 
@@ -246,7 +255,7 @@ void Scores::Free::operator()(float* values) const { std::free(values); }
 
 Snapshot Postings::snapshot() const {
     const std::shared_lock reading(state_);
-    Snapshot now{sealed_, scales_, live_};
+    Snapshot now{sealed_, masses_, live_};
     if (head_.n_places()) now.blocks.push_back(freeze_head());
     return now;
 }
@@ -256,14 +265,14 @@ void Postings::attach(Snapshot snapshot) {
     const std::unique_lock change(state_);
     sealed_ = std::move(snapshot.blocks);
     head_.clear();
-    scales_ = std::move(snapshot.scales);
+    masses_ = std::move(snapshot.masses);
     live_ = std::move(snapshot.live);
     n_live_ = std::count(live_.begin(), live_.end(), uint8_t{1});
 }
 
 int64_t Postings::n_slots() const {
     const std::shared_lock reading(state_);
-    return static_cast<int64_t>(scales_.size());
+    return static_cast<int64_t>(masses_.size());
 }
 
 int64_t Postings::n_live() const {

@@ -37,6 +37,8 @@ struct PlaceView {
 struct QueryView {
     const int32_t* words;
     const float* weights;
+    const float* most;  // a posting counts at most so much, before the weight; nullptr where the signatures are asked
+    float mass;         // the sum that a place would have that shows the same
     const uint64_t* signatures;
     const uint16_t* geometry;
     int64_t n;
@@ -118,23 +120,25 @@ struct Scores {
 // Everything there is at one moment, the head as a block among the others.
 struct Snapshot {
     std::vector<Block> blocks;
-    std::vector<float> scales;
+    std::vector<float> masses;
     std::vector<uint8_t> live;
 };
 
 class Postings {
 public:
     Postings(int64_t n_words, int64_t block_places, bool with_signatures, bool with_geometry,
-             const std::array<float, kCodes>& code_weights, const Kernels& kernels);
+             const std::array<float, kCodes>& code_weights, const std::array<float, kCodes>& code_shares,
+             const Kernels& kernels);
 
-    int64_t add(const PlaceView& place, float scale);  // returns its slot
+    int64_t add(const PlaceView& place, float mass);  // returns its slot
     bool remove(int64_t slot);                         // false if there is none
     std::vector<int32_t> compact();                    // forgets removed places; returns the old slot of each new one
 
-    // Returns for each slot the scale of the place times the sum over common words of the product of both weights.
+    // Returns for each slot the sum over common words of weight times the lesser of both counts, as the codes weigh them,
+    // divided by the greater of both masses.
     Scores votes(const QueryView& query) const;
-    // The same over pairs of postings, each weighed by table[Hamming distance of the signatures]; pairs farther than
-    // `limit` count nothing. With `geometric`, orientation and scale must agree too: only the fullest bin of each of the
+    // The same over pairs of postings, each weighed by the code and by table[Hamming distance of the signatures]; pairs
+    // farther than `limit` count nothing. With `geometric`, orientation and scale must agree too: only the fullest bin of each of the
     // two differences counts, and of both the lesser (Jegou, Douze and Schmid, ECCV 2008).
     Scores near_votes(const QueryView& query, const float* table, int limit, bool geometric) const;
 
@@ -157,18 +161,18 @@ private:
     Block gather(int64_t first, int64_t n, const std::vector<int32_t>& rank, const std::vector<Block>& from) const;
     Block freeze_head() const;
     Scores room(int64_t per_slot) const;
-    Scores finished(Scores scores) const;
+    Scores finished(Scores scores, float mass) const;
 
     const int64_t n_words_, block_places_;
     const bool with_signatures_, with_geometry_;
-    const std::array<float, kCodes> code_weights_;
+    const std::array<float, kCodes> code_weights_, code_shares_;
     const Kernels& kernels_;
 
     std::mutex writer_;
     mutable std::shared_mutex state_;
     std::vector<Block> sealed_;
     Head head_;
-    std::vector<float> scales_;  // 0 where a place was removed
+    std::vector<float> masses_;  // infinite where a place was removed
     std::vector<uint8_t> live_;
     int64_t n_live_ = 0;
 };
