@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth import sensor, specification, world_office
+from seamark.datasets_synth import scenarios, sensor, specification, world_office
 from seamark.datasets_synth.rendering import render_some
 from seamark.datasets_synth.specification import Specification
 from seamark.datasets_synth.worlds import WORLDS
@@ -203,6 +203,15 @@ def conditions_sheet(images: Path) -> None:
     write_sheet(images / "conditions.png", views, 4)
 
 
+def crowd_sheet(images: Path) -> None:
+    """Write one sheet of people, from a moving camera with motion blur and from one that stands still."""
+    views = []
+    for name, indices in (("crowd_stereo", (100, 430, 520)), ("onlooker", (60, 150, 500))):
+        wanted = specification.parse(scenarios.expand(f"{name},sensors=mono"))
+        views += list(render(wanted, indices).values())
+    write_sheet(images / "crowd.png", views, 3)
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("worlds", nargs="*", default=list(WORLDS))
@@ -220,6 +229,7 @@ def main() -> None:
     else:
         print(f"no real data at {DATA}")
     conditions_sheet(chosen.images)
+    crowd_sheet(chosen.images)
 
 
 if __name__ == "__main__":

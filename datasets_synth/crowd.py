@@ -18,7 +18,7 @@ from seamark.datasets_synth.panels import Panel
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 
-MOST_PEOPLE = 14
+MOST_PEOPLE = 16
 CELLS_PER_METRE = 10.0
 MARGIN_M = 8.0  # of the map of free space about the way of the camera
 BODY_Z_M = (0.12, 1.75)  # what lies between is in the way of somebody
@@ -32,10 +32,10 @@ SPARSELY = 6  # looks of which one is taken to refuse by
 STEP = 3  # frames from one look at the picture to the next
 UNSEEN, POPPING = 0.003, 0.02  # shares of the picture below which nobody is missed, and may appear at a distance
 OUTLINE = 0.94  # of what coarse outlines cover is hidden
-MOST_OVER = 1.1  # of the share asked for, by reckoning
+MOST_OVER = 1.15  # of the share asked for, by reckoning
 TYPICAL = 0.3  # of the share asked for: what the median must reach before the crowd is large enough
 PEAKS = 85  # percentile of shares from which on a frame is made a peak
-TRIES = 3000
+TRIES = 8000
 LEAD_S = 4.0  # that somebody may be about before and after an encounter
 
 

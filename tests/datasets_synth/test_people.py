@@ -38,7 +38,7 @@ def _steps(crowd: People, person: int) -> np.ndarray:
 class TestCrowd:
     def test_nobody_runs_and_most_walk(self, crowd: People) -> None:
         speeds = np.concatenate([np.linalg.norm(_steps(crowd, k), axis=1) for k in range(len(crowd.tracks))])
-        assert 4 <= len(crowd.tracks) <= 14
+        assert 4 <= len(crowd.tracks) <= 16
         assert 1.0 < speeds.max() < 2.3
         assert np.mean(speeds > 0.5) > 0.2
         assert 0.05 < np.mean(speeds < 0.15) < 0.8  # some stand for a while
@@ -84,7 +84,7 @@ class TestCrowd:
         planner = Planner(WANTED.poses(), WANTED.rig.cam0, FPS, space, share)
         planner.fill(np.random.default_rng(3))
         assert 0.9 * share < np.percentile(planner.shares, 95) < 1.1 * share
-        assert planner.shares.max() < 1.11 * share
+        assert planner.shares.max() < 1.16 * share
         assert np.median(planner.shares) > 0.2 * share
 
     def test_free_space_ends_at_walls(self) -> None:
