@@ -1,5 +1,6 @@
 """The real renderer: geometry, determinism and cache; skipped where nothing can render."""
 
+import os
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import islice
@@ -124,6 +125,35 @@ def test_night_has_the_geometry_of_the_day(rgbd: tuple[SynthSequence, list[Frame
         assert dark.depth is not None and bright.depth is not None
         assert dark.depth.tobytes() == bright.depth.tobytes()
         assert 0.05 < dark.image.mean() / bright.image.mean() < 0.9
+
+
+def test_any_share_of_the_work_gives_the_same_bits() -> None:
+    wanted = specification.parse("loop,size=small,image=320x240,frames=66,camera=real,condition=changing,movers=1")
+    with RenderPool(wanted) as pool:
+        assert len(pool.pids) == min(2, os.cpu_count() or 1)
+        shared = list(islice(pool.frames(), 9))
+    with RenderPool(wanted, begin=5) as pool:
+        resumed = list(islice(pool.frames(), 4))
+    alone = list(render_some(wanted, [0, 3, 8]))
+    assert [frame.blobs for frame in resumed] == [frame.blobs for frame in shared[5:]]
+    assert [frame.blobs for frame in alone] == [shared[index].blobs for index in (0, 3, 8)]
+
+
+def test_labels_come_back_from_the_cache_and_change_nothing_else(tmp_path: Path) -> None:
+    spec = SPEC + "rgbd,movers=3"
+    sequence = open_synth(spec + ",labels=1", cache_dir=tmp_path)
+    frames = list(sequence.frames())
+    (cached,) = (tmp_path / "synth").iterdir()
+    files = {file.stem: file.read_bytes() for file in (cached / "labels").iterdir()}
+    again = {frame.index: frame.labels for frame in render_some(specification.parse(spec + ",labels=1"), [0, 30, 58])}
+    assert {index: files[f"{index:06d}"] for index in again} == again
+    labels = list(sequence.labels())
+    assert all(image.shape == (240, 320) and image.dtype == np.uint8 for image in labels)
+    assert all(set(np.unique(image)) <= {0, 1, 10, 11, 12} for image in labels)
+    assert all((image == 0).mean() < 0.002 for image in labels)
+    assert max(float((image >= 10).mean()) for image in labels) > 0.01
+    for with_labels, without in zip(frames, _first(open_synth(spec, cache_dir=tmp_path), 2), strict=False):
+        assert with_labels.image.tobytes() == without.image.tobytes()
 
 
 def test_a_distorting_camera_sees_people_and_tells_which_pixels_they_are() -> None:
