@@ -76,6 +76,7 @@ def _room(rng: np.random.Generator) -> list[Panel]:
     s = np.linspace(-half, half, 100)
     path = np.vstack([np.column_stack([s, np.full(100, INNER_DOOR_Y_M)]), [[DOOR_X_M, 0.03 * k] for k in range(100)]])
     occupied = [(np.array([-half + 0.95, 0.75, 0.0]), 0.85), (np.array([-half + 1.0, 1.5, 0.0]), 0.6)]
+    occupied.append((np.array([-0.1, DEPTH_M, 0.0]), 1.0))  # nothing stands before the window
     boxes, footprints = floor_plan.furniture(rng, room, path, FURNITURE, occupied=occupied)
     desk, under = _desk(rng, occupied[0][0])
     panels += [*boxes, *desk, *floor_plan.floor_and_ceiling(rng, room, doors, [*footprints, under], FINISH)]

@@ -86,14 +86,14 @@ def _where(panel: Panel, shift: float = 0.0) -> tuple[float, ...]:
 def test_an_office_is_the_next_one_but_for_a_few_things(worlds: dict[str, World]) -> None:
     panels = worlds["office"].panels
     shared = Counter(id(panel.image) for panel in panels)
-    assert sum(count >= 6 for count in shared.values()) > 60  # the same in all six rooms
+    assert sum(count >= 6 for count in shared.values()) > 40  # the same in all six rooms
     north = [panel for panel in panels if panel.corners[:, 1].min() > world_office.HALF_CORRIDOR_M]
     middle = {_where(p): p for p in north if abs(p.corners[:, 0].mean()) < world_office.PITCH_M / 2}
     east = [p for p in north if 0.5 < p.corners[:, 0].mean() / world_office.PITCH_M < 1.5]
     moved = [middle.get(_where(panel, -world_office.PITCH_M)) for panel in east]
     same = sum(a is not None and a.image is b.image for a, b in zip(moved, east, strict=True))
     assert 5 < len(east) - same < 20  # poster, number, carton; doors that are open there and shut here
-    assert same > 60
+    assert same > 40
 
 
 class TestRuns:
