@@ -8,10 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 class VocabConfig(BaseModel):
     """How places are described, compared and ranked.
 
-    The weights say how far each cue is believed: a place's score is the weighted mean of its votes and of the likeness
-    of its histograms, both in 0..1. Histograms follow the light, so by default they have half the say of the votes
-    among unrelated places (over generated images the votes spread by 0.025, the likeness by 0.13), and rank alone only
-    where an image has no features. Under generated changes of light any larger weight cost more than it gained.
+    The weights say how far each cue is believed: a place's score is the weighted mean of its votes, of the likeness of
+    its histograms and of the likeness of its view, each in 0..1. Histograms follow the light, so by default they have
+    half the say of the votes among unrelated places (over generated images the votes spread by 0.025, the likeness by
+    0.13); under generated changes of light any larger weight cost more than it gained. The view, edges on a coarse
+    grid, hardly minds light, but minds another direction of the camera, which the votes forgive. The votes of an image
+    with few features are mostly chance and count less.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,6 +37,10 @@ class VocabConfig(BaseModel):
     )
     votes_weight: float = Field(default=1.0, ge=0.0, description="Weight of the visual words in the score.")
     histogram_weight: float = Field(default=0.1, ge=0.0, description="Weight of the colour histograms in the score.")
+    view_weight: float = Field(default=0.4, ge=0.0, description="Weight of the view, the edges of the whole image.")
+    trusted_features: int = Field(
+        default=200, ge=1, description="With fewer features than this an image's votes count proportionally less."
+    )
     histogram_bins: int = Field(default=32, ge=4, le=256, description="Bins of each of the six histograms.")
     histogram_sigma_bins: float = Field(
         default=1.0,
@@ -45,6 +51,6 @@ class VocabConfig(BaseModel):
 
     @model_validator(mode="after")
     def _some_cue_counts(self) -> Self:
-        if self.votes_weight + self.histogram_weight <= 0.0:
-            raise ValueError("votes_weight and histogram_weight must not both be 0")
+        if self.votes_weight + self.histogram_weight + self.view_weight <= 0.0:
+            raise ValueError("votes_weight, histogram_weight and view_weight must not all be 0")
         return self

@@ -1,16 +1,18 @@
 """The places seen so far, and which of them an image may show."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.vocab import histogram
+from seamark.vocab import histogram, view
 from seamark.vocab.config import VocabConfig
 from seamark.vocab.errors import DuplicatePlaceError, UnknownPlaceError
 from seamark.vocab.histogram import Histograms
 from seamark.vocab.inverted_index import InvertedIndex
 from seamark.vocab.types import Candidate, Candidates, PlaceObservation
+from seamark.vocab.view import View
 from seamark.vocab.vocabulary import Vocabulary, check_descriptors
 
 NANOSECONDS = 1_000_000_000
@@ -19,10 +21,11 @@ COMPACT_FROM = 64  # removed places; fewer are kept, however few others there ar
 
 
 class PlaceIndex:
-    """Ranks all places by how much they look like an image: votes of visual words and likeness of colour histograms.
+    """Ranks all places by how much they look like an image: votes of visual words, colour histograms, and the view.
 
-    The score is the weighted mean of the votes and of 1 - J / (2 ln 2), J the Jeffrey divergence; see VocabConfig for
-    the weights. The recent past of the image's own session is never a candidate, nor is the image itself.
+    The score is the weighted mean of the votes, of 1 - J / (2 ln 2), J the Jeffrey divergence, and of the likeness of
+    the view; see VocabConfig for the weights. It depends on two images alone, so that rankings of shards merge. The
+    recent past of the image's own session is never a candidate, nor is the image itself.
     """
 
     def __init__(self, vocabulary: Vocabulary, config: VocabConfig | None = None) -> None:
@@ -49,9 +52,9 @@ class PlaceIndex:
             ObservationError: arrays of the wrong shape or type; nothing changes.
         """
         self._refuse_known(observation.id)
-        words, histograms = self._describe(observation)
-        candidates = self._rank(observation, words, histograms, self.config.candidates)
-        self._insert(observation, words, histograms)
+        looks = self._describe(observation)
+        candidates = self._rank(observation, looks, self.config.candidates)
+        self._insert(observation, looks)
         return candidates
 
     def add(self, observation: PlaceObservation) -> None:
@@ -62,7 +65,7 @@ class PlaceIndex:
             ObservationError: arrays of the wrong shape or type; nothing changes.
         """
         self._refuse_known(observation.id)
-        self._insert(observation, *self._describe(observation))
+        self._insert(observation, self._describe(observation))
 
     def query(self, observation: PlaceObservation, limit: int | None = None) -> Candidates:
         """Rank the places that an image may show: at most ``limit`` (default: the configuration's), best first.
@@ -71,7 +74,7 @@ class PlaceIndex:
             ObservationError: arrays of the wrong shape or type.
         """
         limit = self.config.candidates if limit is None else limit
-        return self._rank(observation, *self._describe(observation), limit)
+        return self._rank(observation, self._describe(observation), limit)
 
     def remove(self, place_id: int) -> None:
         """Forget a place; its id may be added again.
@@ -96,14 +99,15 @@ class PlaceIndex:
         if place_id in self._slot_of:
             raise DuplicatePlaceError(f"place {place_id} is in the index already")
 
-    def _describe(self, observation: PlaceObservation) -> tuple[NDArray[np.int32], Histograms]:
+    def _describe(self, observation: PlaceObservation) -> "_Looks":
         check_descriptors(observation.descriptors)
         bins, sigma_bins = self.config.histogram_bins, self.config.histogram_sigma_bins
         histograms = histogram.describe(observation.thumbnail, bins, sigma_bins)
-        return self.vocabulary.assign(observation.descriptors[: self.config.max_descriptors]), histograms
+        words = self.vocabulary.assign(observation.descriptors[: self.config.max_descriptors])
+        return _Looks(words, histograms, view.describe(observation.thumbnail))
 
-    def _insert(self, observation: PlaceObservation, words: NDArray[np.int32], histograms: Histograms) -> None:
-        slot = self._inverted.add(words)
+    def _insert(self, observation: PlaceObservation, looks: "_Looks") -> None:
+        slot = self._inverted.add(looks.words)
         if slot >= len(self._table):
             more = max(64, len(self._table) // 2)
             self._table = np.concatenate([self._table, np.zeros(more, self._table.dtype)])
@@ -114,33 +118,38 @@ class PlaceIndex:
             observation.stamp_ns,
             ordinal,
             True,
-            histograms.present,
-            histograms.values,
+            looks.histograms.present,
+            looks.histograms.values,
+            looks.view.cells,
+            looks.view.totals,
         )
         self._added_to[observation.session] = ordinal + 1
         self._slot_of[observation.id] = slot
 
-    def _rank(
-        self, observation: PlaceObservation, words: NDArray[np.int32], histograms: Histograms, limit: int
-    ) -> Candidates:
+    def _rank(self, observation: PlaceObservation, looks: "_Looks", limit: int) -> Candidates:
         places = self._table[: self._inverted.n_slots]
-        votes = self._inverted.votes(words).astype(np.float64)
-        jeffrey = histogram.divergence_to_all(histograms, places["values"], places["present"]).astype(np.float64)
-        score = self._fuse(votes, jeffrey)
+        votes = self._inverted.votes(looks.words).astype(np.float64)
+        jeffrey = histogram.divergence_to_all(looks.histograms, places["values"], places["present"]).astype(np.float64)
+        likeness = view.likeness_to_all(looks.view, places["cells"], places["totals"]).astype(np.float64)
+        score = self._fuse(votes * min(1.0, len(looks.words) / self.config.trusted_features), jeffrey, likeness)
         slots = np.flatnonzero(self._eligible(observation, places))
         if len(slots) > limit > 0:  # spare the sort of all: nothing below the limit-th score can be ranked
             threshold = np.partition(score[slots], len(slots) - limit)[len(slots) - limit]
             slots = slots[score[slots] >= threshold]
         slots = slots[np.lexsort((places["id"][slots], -score[slots]))][:limit]
         ranked = tuple(
-            Candidate(int(places["id"][s]), float(score[s]), float(votes[s]), float(jeffrey[s])) for s in slots
+            Candidate(int(places["id"][s]), float(score[s]), float(votes[s]), float(jeffrey[s]), float(likeness[s]))
+            for s in slots
         )
         return Candidates(observation.id, observation.stamp_ns, ranked)
 
-    def _fuse(self, votes: NDArray[np.float64], jeffrey: NDArray[np.float64]) -> NDArray[np.float64]:
-        likeness = 1.0 - jeffrey / histogram.MAX_DIVERGENCE
-        by_votes, by_histogram = self.config.votes_weight, self.config.histogram_weight
-        fused: NDArray[np.float64] = (by_votes * votes + by_histogram * likeness) / (by_votes + by_histogram)
+    def _fuse(
+        self, votes: NDArray[np.float64], jeffrey: NDArray[np.float64], likeness: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        config = self.config
+        by_colour = config.histogram_weight * (1.0 - jeffrey / histogram.MAX_DIVERGENCE)
+        total = config.votes_weight * votes + by_colour + config.view_weight * likeness
+        fused: NDArray[np.float64] = total / (config.votes_weight + config.histogram_weight + config.view_weight)
         return np.clip(fused, 0.0, 1.0)
 
     def _eligible(self, observation: PlaceObservation, places: NDArray[Any]) -> NDArray[np.bool_]:
@@ -151,6 +160,15 @@ class PlaceIndex:
         recent = same_session & (near | (places["ordinal"] >= last))
         eligible: NDArray[np.bool_] = places["live"] & ~recent & (places["id"] != observation.id)
         return eligible
+
+
+@dataclass(frozen=True, eq=False)
+class _Looks:
+    """What the index compares of an image."""
+
+    words: NDArray[np.int32]
+    histograms: Histograms
+    view: View
 
 
 def _place_type(bins: int) -> np.dtype[Any]:
@@ -164,6 +182,8 @@ def _place_type(bins: int) -> np.dtype[Any]:
             ("live", np.bool_),
             ("present", np.bool_, channels),
             ("values", np.float32, (channels, bins)),
+            ("cells", np.int8, (view.ROWS, view.COLUMNS, view.ORIENTATIONS)),
+            ("totals", np.float32, (2, view.COLUMNS)),
         ],
         align=True,
     )

@@ -26,14 +26,16 @@ class PlaceObservation:
 class Candidate:
     """One place that may be the one seen, with its evidence.
 
-    ``score`` fuses votes and histograms, higher is better. ``votes`` is the tf-idf similarity in 0..1. ``jeffrey`` is
-    the Jeffrey divergence of the colour histograms, 0 for equal ones.
+    ``score`` fuses votes, histograms and view, 0..1, higher is better. ``votes`` is the tf-idf similarity in 0..1.
+    ``jeffrey`` is the Jeffrey divergence of the colour histograms, 0 for equal ones. ``view`` is the likeness of the
+    edges of the whole image, 0..1.
     """
 
     id: int
     score: float
     votes: float
     jeffrey: float
+    view: float = 0.0
 
 
 @dataclass(frozen=True)

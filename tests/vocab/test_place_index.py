@@ -69,16 +69,19 @@ def test_a_second_round_finds_every_place_of_the_first(vocabulary: Vocabulary) -
         assert 0 <= best.jeffrey < 0.2
 
 
-def test_scores_fuse_votes_and_histograms_by_their_weights(vocabulary: Vocabulary) -> None:
-    world = World(vocabulary)
-    index = PlaceIndex(vocabulary, VocabConfig(votes_weight=3, histogram_weight=1, candidates=100))
+@pytest.mark.parametrize(("trusted", "believed"), [(60, 1.0), (240, 0.25)])
+def test_scores_fuse_the_cues_by_their_weights(vocabulary: Vocabulary, trusted: int, believed: float) -> None:
+    world = World(vocabulary)  # each look has 60 features
+    weights = {"votes_weight": 3, "histogram_weight": 1, "view_weight": 2}
+    index = PlaceIndex(vocabulary, VocabConfig(**weights, trusted_features=trusted, candidates=100))
     for place in range(30):
         index.add(world.look(place, place))
     ranked = index.query(world.look(4, -1, session=-1)).ranked
     assert len(ranked) == 30
     for candidate in ranked:
         likeness = 1 - candidate.jeffrey / (2 * np.log(2))
-        assert candidate.score == pytest.approx((3 * candidate.votes + likeness) / 4, abs=1e-9)
+        fused = (3 * believed * candidate.votes + likeness + 2 * candidate.view) / 6
+        assert candidate.score == pytest.approx(fused, abs=1e-9)
         assert 0 <= candidate.score <= 1
     assert [c.score for c in ranked] == sorted((c.score for c in ranked), reverse=True)
 
@@ -231,5 +234,5 @@ def test_two_indices_with_one_history_answer_alike(vocabulary: Vocabulary) -> No
 
 
 def test_some_cue_must_count() -> None:
-    with pytest.raises(ValidationError, match="must not both be 0"):
-        VocabConfig(votes_weight=0, histogram_weight=0)
+    with pytest.raises(ValidationError, match="must not all be 0"):
+        VocabConfig(votes_weight=0, histogram_weight=0, view_weight=0)
