@@ -4,8 +4,9 @@
 
 Renders SPECIFICATION (loop,frames=400) as ``seamark synth render`` does, into a folder that is deleted afterwards:
 wall seconds from before the workers are started until the last file is written, CPU seconds (user and system) of
-workers and parent, and their resident memory along the way. Then, in a worker process of its own, ``--stages`` frames
-from the middle of it, every other one as one of two workers makes them, with the CPU time of each stage. Where others use the machine, trust CPU seconds and the fastest of several runs.
+workers and parent, and their resident memory along the way. Then, in a process of its own, ``--stages`` frames from the
+middle of it, every other one as one of two workers makes them, with the CPU time of each stage. Where others use the
+machine, trust CPU seconds and the fastest of several runs.
 """
 
 import argparse
