@@ -20,7 +20,7 @@ from seamark.datasets_synth.worker import HEADER
 COMMAND = (sys.executable, "-P", "-m", "seamark.datasets_synth.worker")
 PROBE_TIMEOUT_S = 60.0
 POLL_S = 0.5
-FRAME_TIMEOUT_S = 240.0  # a first picture takes seconds of CPU, on a loaded machine minutes
+FRAME_TIMEOUT_S = 240.0  # a worker takes seconds of CPU to build its world, on a loaded machine minutes
 FRAMES_AHEAD = 12  # per worker: coded frames that wait for the consumer
 FRAMES_FOR_TWO_WORKERS = 60  # below that a second start-up costs more than it brings
 
