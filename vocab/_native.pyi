@@ -26,7 +26,7 @@ class Quantiser:
     @property
     def level(self) -> str: ...
     def assign(
-        self, descriptors: NDArray[np.uint8], k: int = 1, beam: int = 1
+        self, descriptors: NDArray[np.uint8], k: int = 1, beam: int = 1, reach: int = 0x7FFFFFFF
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]: ...
 
 class Postings:

@@ -1,5 +1,6 @@
 """The vocabulary file: round trip, damage, versions."""
 
+import hashlib
 import json
 import struct
 from pathlib import Path
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from seamark.vocab import store
 from seamark.vocab.errors import VocabularyFileError
-from seamark.vocab.vocabulary import Vocabulary
+from seamark.vocab.vocabulary import Cells, Vocabulary
 
 
 @pytest.fixture
@@ -40,14 +41,61 @@ def test_the_layout_is_the_documented_one(path: Path, vocabulary: Vocabulary) ->
     """Read the file by hand, as another program would."""
     content = path.read_bytes()
     magic, version, header_length = struct.unpack_from("<8sII", content)
-    assert (magic, version) == (b"SMVOCAB\0", 1)
+    assert (magic, version) == (b"SMVOCAB\0", 2)
     start = 48 + header_length
     assert start % 64 == 0
-    header = json.loads(content[48:start])
-    assert (header["n_words"], header["descriptor_size"]) == (37, 128)
-    np.testing.assert_array_equal(np.frombuffer(content, "<f4", 37, start), vocabulary.idf)
-    words = np.frombuffer(content, np.uint8, offset=start + 37 * 4)
+    sections = json.loads(content[48:start])["sections"]
+    assert sections["idf"]["offset"] % 64 == sections["words"]["offset"] % 64 == 0
+    assert (sections["idf"]["dtype"], sections["idf"]["shape"]) == ("<f4", [37])
+    np.testing.assert_array_equal(np.frombuffer(content, "<f4", 37, sections["idf"]["offset"]), vocabulary.idf)
+    words = np.frombuffer(content, np.uint8, 37 * 128, sections["words"]["offset"])
     np.testing.assert_array_equal(words.reshape(37, 128), vocabulary.words)
+
+
+def test_version_1_is_still_read(tmp_path: Path, vocabulary: Vocabulary) -> None:
+    header = json.dumps({"n_words": 37, "descriptor_size": 128, "provenance": {"seed": 7}}).encode()
+    header = header.ljust(-(48 + len(header)) % 64 + len(header))
+    body = header + vocabulary.idf.tobytes() + vocabulary.words.tobytes()
+    preamble = struct.pack("<8sII", b"SMVOCAB\0", 1, len(header))
+    old = tmp_path / "old.vocab"
+    old.write_bytes(preamble + hashlib.sha256(preamble + body).digest() + body)
+    loaded = Vocabulary.load(old)
+    np.testing.assert_array_equal(loaded.words, vocabulary.words)
+    assert loaded.hash == vocabulary.hash and loaded.cells is None and dict(loaded.provenance) == {"seed": 7}
+    body = body[:-128]
+    old.write_bytes(preamble + hashlib.sha256(preamble + body).digest() + body)
+    with pytest.raises(VocabularyFileError, match="do not hold 37 words"):
+        Vocabulary.load(old)
+
+
+def test_cells_and_extras_travel_along(tmp_path: Path, vocabulary: Vocabulary) -> None:
+    cells = Cells(vocabulary.words[:4].copy(), np.array([0, 10, 10, 20, 37]), 2, 5000)
+    projection = np.random.default_rng(1).normal(size=(64, 128)).astype(np.float32)
+    whole = Vocabulary(vocabulary.words, vocabulary.idf, {}, cells=cells, extras={"projection": projection})
+    whole.save(tmp_path / "tree.vocab")
+    loaded = Vocabulary.load(tmp_path / "tree.vocab")
+    assert loaded.cells is not None and (loaded.cells.beam, loaded.cells.reach) == (2, 5000)
+    np.testing.assert_array_equal(loaded.cells.centres, cells.centres)
+    np.testing.assert_array_equal(loaded.cells.offsets, cells.offsets)
+    assert loaded.extras.keys() == {"projection"}
+    np.testing.assert_array_equal(loaded.extras["projection"], projection)
+    assert loaded.hash == whole.hash != vocabulary.hash
+    other = Vocabulary(vocabulary.words, vocabulary.idf, {}, cells=cells, extras={"projection": 2 * projection})
+    assert other.hash != whole.hash
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"words": np.zeros((3, 128), np.uint8)},
+        {"words": np.zeros((3, 128), np.uint8), "idf": np.ones(3, np.float32), "cell_centres": np.zeros((2, 128))},
+        {"words": np.zeros((3, 128), np.float32), "idf": np.ones(3, np.float32)},
+    ],
+)
+def test_sections_that_do_not_fit_are_refused(tmp_path: Path, sections: dict[str, np.ndarray]) -> None:
+    store.write(tmp_path / "odd.vocab", sections, {})
+    with pytest.raises(VocabularyFileError, match=r"odd\.vocab: damaged"):
+        Vocabulary.load(tmp_path / "odd.vocab")
 
 
 def test_saving_twice_gives_the_same_bytes_and_leaves_nothing_else(path: Path, vocabulary: Vocabulary) -> None:
@@ -129,6 +177,6 @@ def test_a_failed_save_leaves_the_old_file(path: Path, vocabulary: Vocabulary, t
 
 def test_a_vocabulary_whose_weights_make_no_sense_is_refused(path: Path, vocabulary: Vocabulary) -> None:
     """A file with a right checksum and wrong content, as a faulty program could write it."""
-    store.write(path, vocabulary.words, np.zeros(37, np.float32), {})
+    store.write(path, {"words": vocabulary.words, "idf": np.zeros(37, np.float32)}, {})
     with pytest.raises(VocabularyFileError, match=r"some\.vocab"):
         Vocabulary.load(path)

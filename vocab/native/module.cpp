@@ -67,14 +67,14 @@ Quantiser make_quantiser(const Descriptors& words, const Descriptors& coarse, co
 
 std::tuple<Out<int32_t, nb::ndim<2>>, Out<int32_t, nb::ndim<2>>> assign(const Quantiser& quantiser,
                                                                         const Descriptors& descriptors, int k,
-                                                                        int beam) {
-    require(k >= 1 && beam >= 1, "k and beam must be at least 1");
+                                                                        int beam, int32_t reach) {
+    require(k >= 1 && beam >= 1 && reach >= 0, "k and beam must be at least 1, reach at least 0");
     const size_t n = descriptors.shape(0);
     std::vector<int32_t> words(n * static_cast<size_t>(k)), distances(words.size());
     {
         nb::gil_scoped_release free;
         std::vector<Near> found(words.size());
-        quantiser.assign(descriptors.data(), static_cast<int64_t>(n), k, beam, found.data());
+        quantiser.assign(descriptors.data(), static_cast<int64_t>(n), k, beam, reach, found.data());
         for (size_t i = 0; i < found.size(); ++i) {
             words[i] = found[i].word;
             distances[i] = found[i].distance;
@@ -249,7 +249,7 @@ NB_MODULE(_native, m) {
              },
              "words"_a, "coarse"_a, "offsets"_a, "level"_a = nb::none())
         .def_prop_ro("level", [](const Quantiser& self) { return self.kernels().name; })
-        .def("assign", &assign, "descriptors"_a, "k"_a = 1, "beam"_a = 1);
+        .def("assign", &assign, "descriptors"_a, "k"_a = 1, "beam"_a = 1, "reach"_a = 0x7fffffff);
 
     nb::class_<Postings>(m, "Postings")
         .def(nb::new_(&make_postings), "n_words"_a, "code_weights"_a, "code_shares"_a, "block_places"_a = kMostPlaces,

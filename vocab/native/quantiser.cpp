@@ -70,12 +70,12 @@ Quantiser::Quantiser(const uint8_t* words, const uint8_t* coarse, std::vector<in
     if (n_cells > 1) coarse_.append(coarse, n_cells);
 }
 
-void Quantiser::assign(const uint8_t* descriptors, int64_t n, int k, int beam, Near* out) const {
+void Quantiser::assign(const uint8_t* descriptors, int64_t n, int k, int beam, int32_t reach, Near* out) const {
     for (int64_t start = 0; start < n; start += kBatch)
-        assign_some(descriptors + start * kDescriptorSize, std::min(kBatch, n - start), k, beam, out + start * k);
+        assign_some(descriptors + start * kDescriptorSize, std::min(kBatch, n - start), k, beam, reach, out + start * k);
 }
 
-void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int beam, Near* out) const {
+void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int beam, int32_t reach, Near* out) const {
     const auto n_cells = static_cast<int64_t>(offsets_.size()) - 1;
     beam = static_cast<int>(std::min<int64_t>(beam, n_cells));
     std::fill(out, out + n * k, Near{std::numeric_limits<int32_t>::max(), -1});
@@ -86,15 +86,21 @@ void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int be
     } else {
         std::vector<Near> cells(static_cast<size_t>(n) * beam, Near{std::numeric_limits<int32_t>::max(), -1});
         search(coarse_, 0, n_cells, 0, descriptors, which.data(), n, beam, cells.data(), scratch);
+        const auto near = [&](size_t i) {
+            const size_t nearest = i / static_cast<size_t>(beam) * static_cast<size_t>(beam);
+            return int64_t{cells[i].distance} - cells[nearest].distance <= reach;
+        };
         // Sort the descriptors by cell, so that the words of a cell are read once for all of them.
         std::vector<int64_t> start(static_cast<size_t>(n_cells) + 1, 0);
-        for (const Near& cell : cells) ++start[static_cast<size_t>(cell.word) + 1];
+        for (size_t i = 0; i < cells.size(); ++i)
+            if (near(i)) ++start[static_cast<size_t>(cells[i].word) + 1];
         std::partial_sum(start.begin(), start.end(), start.begin());
-        std::vector<int32_t> sorted(cells.size());
+        std::vector<int32_t> sorted(static_cast<size_t>(start.back()));
         std::vector<int64_t> next(start.begin(), start.end() - 1);
         for (size_t i = 0; i < cells.size(); ++i)
-            sorted[static_cast<size_t>(next[static_cast<size_t>(cells[i].word)]++)] =
-                static_cast<int32_t>(i / static_cast<size_t>(beam));
+            if (near(i))
+                sorted[static_cast<size_t>(next[static_cast<size_t>(cells[i].word)]++)] =
+                    static_cast<int32_t>(i / static_cast<size_t>(beam));
         for (int64_t c = 0; c < n_cells; ++c)
             search(words_, first_group_[c], offsets_[c + 1] - offsets_[c], static_cast<int32_t>(offsets_[c]),
                    descriptors, sorted.data() + start[c], start[c + 1] - start[c], k, out, scratch);

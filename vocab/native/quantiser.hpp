@@ -43,13 +43,14 @@ public:
     Quantiser(const uint8_t* words, const uint8_t* coarse, std::vector<int64_t> offsets, const Kernels& kernels);
 
     // Finds for each of n descriptors the k nearest words of the `beam` nearest cells, nearest first, the lower word of
-    // equally near ones. Where the cells hold fewer, the word is -1.
-    void assign(const uint8_t* descriptors, int64_t n, int k, int beam, Near* out) const;
+    // equally near ones; cells whose centre is farther than the nearest by more than `reach`, in squared distance, are
+    // left out. Where the cells hold fewer words, the word is -1.
+    void assign(const uint8_t* descriptors, int64_t n, int k, int beam, int32_t reach, Near* out) const;
 
     const Kernels& kernels() const { return kernels_; }
 
 private:
-    void assign_some(const uint8_t* descriptors, int64_t n, int k, int beam, Near* out) const;
+    void assign_some(const uint8_t* descriptors, int64_t n, int k, int beam, int32_t reach, Near* out) const;
     void search(const Grouped& grouped, int64_t first_group, int64_t n_words, int32_t first_word,
                 const uint8_t* descriptors, const int32_t* which, int64_t n, int k, Near* out,
                 std::vector<int32_t>& scratch) const;
