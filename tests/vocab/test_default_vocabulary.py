@@ -21,13 +21,14 @@ def vocabulary() -> Vocabulary:
 
 
 def test_the_default_is_what_was_promised(vocabulary: Vocabulary) -> None:
-    assert vocabulary.words.shape == (16384, 128) and vocabulary.words.dtype == np.uint8
-    assert vocabulary.idf.shape == (16384,)
+    assert vocabulary.words.shape == (65536, 128) and vocabulary.words.dtype == np.uint8
+    assert vocabulary.idf.shape == (65536,)
+    assert vocabulary.cells is not None and len(vocabulary.cells.centres) == 256
     assert 0 < vocabulary.idf.min() < vocabulary.idf.max() <= np.log(vocabulary.provenance["n_images"]) + 1e-6
-    assert len(np.unique(vocabulary.words, axis=0)) > 16000
+    assert len(np.unique(vocabulary.words, axis=0)) > 64000
     assert vocabulary.provenance["images"].startswith("seamark.datasets_synth.imagery")
     size = (Path(seamark.vocab.__file__).parent / "default.vocab").stat().st_size
-    assert 16384 * 132 < size < 2_300_000
+    assert 65536 * 132 < size <= 10_000_000
 
 
 def test_its_words_lie_where_root_sift_lies(vocabulary: Vocabulary) -> None:
@@ -39,7 +40,7 @@ def test_its_words_lie_where_root_sift_lies(vocabulary: Vocabulary) -> None:
 def test_hardly_a_word_is_there_twice(vocabulary: Vocabulary) -> None:
     """Each word is its own nearest word, but for the few that appear twice."""
     assigned = vocabulary.assign(np.asarray(vocabulary.words))
-    assert np.mean(assigned == np.arange(16384)) > 0.97
+    assert np.mean(assigned == np.arange(65536)) > 0.97
 
 
 @pytest.mark.real_data

@@ -1,12 +1,15 @@
 """Training: deterministic, a fair sample, right weights."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from seamark.vocab.clustering import k_means, two_level_k_means
 from seamark.vocab.errors import ObservationError, TrainingError
 from seamark.vocab.training import document_frequency, sample_descriptors, train
+from seamark.vocab.vocabulary import Cells, Vocabulary
 
 
 def batches(seed: int, n_images: int, per_image: int, centres: int = 40) -> Iterator[np.ndarray]:
@@ -92,10 +95,78 @@ def test_images_without_features_count_as_images() -> None:
     assert train(data, 5, seed=1).provenance["n_images"] == 20
 
 
+def test_two_levels_lose_little_against_one() -> None:
+    """The cells of 40 centres: words at their place, sorted by cell, and almost as near as flat ones."""
+    descriptors = np.concatenate(list(batches(8, 40, 100)))
+    words, centres, offsets = two_level_k_means(descriptors, 160, 10, 3, 8, lambda _done: None)
+    assert words.shape == (160, 128) and centres.shape == (10, 128)
+    assert offsets[0] == 0 and offsets[-1] == 160 and (np.diff(offsets) >= 1).all()
+    flat = Vocabulary(k_means(descriptors, 160, 3, 8), np.ones(160, np.float32))
+    tree = Vocabulary(words, np.ones(160, np.float32), cells=Cells(centres, offsets, 10, 2**31 - 1))
+    exact = Vocabulary(words, np.ones(160, np.float32))
+    errors = [vocabulary.assign_soft(descriptors, 1)[1].mean() for vocabulary in (flat, tree)]
+    assert 0.5 < errors[1] / errors[0] < 1.5
+    np.testing.assert_array_equal(tree.assign(descriptors), exact.assign(descriptors))
+    nearest = ((words[:, None].astype(int) - centres[None].astype(int)) ** 2).sum(axis=2).argmin(axis=1)
+    assert np.mean(nearest == np.repeat(np.arange(10), np.diff(offsets))) > 0.9
+
+
+def test_large_vocabularies_get_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("seamark.vocab.training.FLAT_UP_TO", 100)
+    monkeypatch.setattr("seamark.vocab.training.WORDS_PER_CELL", 16)
+    heard: list[tuple[str, int]] = []
+    data = list(batches(9, 30, 60))
+    vocabulary = train(data, 200, seed=4, progress=lambda stage, count: heard.append((stage, count)))
+    assert vocabulary.cells is not None and len(vocabulary.cells.centres) == 13
+    assert [count for stage, count in heard if stage == "clustering"] == list(range(1, 14))
+    seen = [set(vocabulary.assign(batch).tolist()) for batch in data]
+    counts = np.array([sum(word in words for words in seen) for word in range(200)])
+    np.testing.assert_allclose(vocabulary.idf, np.maximum(np.log(30 / np.maximum(counts, 1)), 1e-3), rtol=1e-6)
+    assert vocabulary.hash == train(data, 200, seed=4).hash
+
+
+def test_an_empty_cluster_takes_the_farthest_descriptor() -> None:
+    descriptors = np.zeros((50, 128), np.uint8)
+    descriptors[7] = 200
+    centres = k_means(descriptors, 2, 1, 3)
+    assert sorted(centres[:, 0].tolist()) == [0, 200]
+
+
+def test_a_training_that_was_killed_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("seamark.vocab.training.CHECKPOINT_IMAGES", 7)
+    data = list(batches(10, 30, 40))
+    computed: list[int] = []
+
+    def stream(until: int) -> Iterator[Callable[[], np.ndarray]]:
+        for number, batch in enumerate(data):
+            if number == until:
+                raise KeyboardInterrupt
+            yield lambda number=number, batch=batch: (computed.append(number), batch)[1]
+
+    checkpoint = tmp_path / "sample.npz"
+    with pytest.raises(KeyboardInterrupt):
+        train(stream(17), 50, seed=1, max_descriptors=300, checkpoint=checkpoint)
+    computed.clear()
+    resumed = train(stream(-1), 50, seed=1, max_descriptors=300, checkpoint=checkpoint)
+    assert computed == list(range(14, 30))
+    assert resumed.hash == train(data, 50, seed=1, max_descriptors=300).hash
+    assert dict(resumed.provenance)["n_images"] == 30
+    computed.clear()
+    assert train(stream(-1), 50, seed=1, max_descriptors=300, checkpoint=checkpoint).hash == resumed.hash
+    assert not computed
+    with pytest.raises(TrainingError, match="seed 1, not of 300 and 2"):
+        train(stream(-1), 50, seed=2, max_descriptors=300, checkpoint=checkpoint)
+    with pytest.raises(TrainingError, match="the stream has 3"):
+        train(data[:3], 50, seed=1, max_descriptors=300, checkpoint=checkpoint)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
+    with pytest.raises(TrainingError, match="damaged checkpoint"):
+        train(data, 50, seed=1, max_descriptors=300, checkpoint=checkpoint)
+
+
 def test_progress_is_reported_in_order() -> None:
     heard: list[tuple[str, int]] = []
     train(batches(6, 3, 30), 10, seed=1, iterations=4, progress=lambda stage, count: heard.append((stage, count)))
-    assert heard == [("reading", 1), ("reading", 2), ("reading", 3), ("clustering", 4), ("weighting", 3)]
+    assert heard == [("reading", 1), ("reading", 2), ("reading", 3), ("clustering", 1), ("weighting", 3)]
 
 
 def test_too_few_descriptors_and_wrong_ones_are_refused() -> None:
