@@ -11,6 +11,10 @@ class VocabularyFileError(SeamarkError):
     """A vocabulary file that is missing, damaged, or of a version this program does not read."""
 
 
+class IndexFileError(SeamarkError):
+    """A place index on disk that is missing, damaged, of another vocabulary, or of other settings."""
+
+
 class TrainingError(SeamarkError):
     """Training data from which no vocabulary can be made."""
 

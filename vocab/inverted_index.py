@@ -49,6 +49,7 @@ class InvertedIndex:
         self._idf = idf
         self.with_signatures = with_signatures
         self.with_geometry = with_geometry
+        self.block_places = block_places
         counts = np.maximum(np.arange(MOST_COUNTED + 1), 1)
         weights = np.sqrt(counts).astype(np.float32)
         # Where every descriptor has a posting of its own, the postings of a word share its weight.

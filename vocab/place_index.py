@@ -1,14 +1,16 @@
 """The places seen so far, and which of them an image may show."""
 
+import threading
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.vocab import histogram, view
+from seamark.vocab import histogram, index_file, view
 from seamark.vocab.config import VocabConfig
-from seamark.vocab.errors import DuplicatePlaceError, UnknownPlaceError
+from seamark.vocab.errors import DuplicatePlaceError, IndexFileError, UnknownPlaceError
 from seamark.vocab.histogram import Histograms
 from seamark.vocab.inverted_index import InvertedIndex
 from seamark.vocab.types import Candidate, Candidates, PlaceObservation
@@ -35,6 +37,8 @@ class PlaceIndex:
         self._slot_of: dict[int, int] = {}
         self._added_to: dict[int, int] = {}  # session -> places ever added to it
         self._table = np.zeros(0, _place_type(self.config.histogram_bins))
+        self._changing = threading.Lock()  # held while places change, so that a file holds one moment
+        self._opened: index_file.IndexFile | None = None  # until the first use, which verifies and reads it
 
     def __len__(self) -> int:
         """Return the number of places."""
@@ -51,6 +55,7 @@ class PlaceIndex:
             DuplicatePlaceError: its id is in the index already; nothing changes.
             ObservationError: arrays of the wrong shape or type; nothing changes.
         """
+        self._read_opened()
         self._refuse_known(observation.id)
         looks = self._describe(observation)
         candidates = self._rank(observation, looks, self.config.candidates)
@@ -64,6 +69,7 @@ class PlaceIndex:
             DuplicatePlaceError: its id is in the index already; nothing changes.
             ObservationError: arrays of the wrong shape or type; nothing changes.
         """
+        self._read_opened()
         self._refuse_known(observation.id)
         self._insert(observation, self._describe(observation))
 
@@ -73,6 +79,7 @@ class PlaceIndex:
         Raises:
             ObservationError: arrays of the wrong shape or type.
         """
+        self._read_opened()
         limit = self.config.candidates if limit is None else limit
         return self._rank(observation, self._describe(observation), limit)
 
@@ -82,14 +89,69 @@ class PlaceIndex:
         Raises:
             UnknownPlaceError: the index holds no such place.
         """
+        self._read_opened()
         if place_id not in self._slot_of:
             raise UnknownPlaceError(f"place {place_id} is not in the index")
-        slot = self._slot_of.pop(place_id)
-        self._inverted.remove(slot)
-        self._table[slot]["id"] = NO_PLACE
-        self._table[slot]["live"] = False
-        if self._inverted.n_slots > 2 * len(self._slot_of) + COMPACT_FROM:
-            self._compact()
+        with self._changing:
+            slot = self._slot_of.pop(place_id)
+            self._inverted.remove(slot)
+            self._table[slot]["id"] = NO_PLACE
+            self._table[slot]["live"] = False
+            if self._inverted.n_slots > 2 * len(self._slot_of) + COMPACT_FROM:
+                self._compact()
+
+    def save(self, path: Path | str) -> None:
+        """Write the index to a file, replacing an older one only when the new one is complete on disk.
+
+        May run in a thread of its own: queries go on, additions wait only while the newest block is copied.
+
+        Raises:
+            IndexFileError: the file cannot be written.
+        """
+        self._read_opened()
+        with self._changing:
+            snapshot = self._inverted.snapshot()
+            table = self._table[: len(snapshot[1])].copy()
+            facts = {"added_to": {str(session): count for session, count in self._added_to.items()}}
+        columns = {f"table.{name}": table[name] for name in table.dtype.names or ()}
+        index_file.save(Path(path), self.vocabulary.hash, self._inverted, snapshot, facts, columns)
+
+    @classmethod
+    def load(cls, path: Path | str, vocabulary: Vocabulary, config: VocabConfig | None = None) -> "PlaceIndex":
+        """Open an index that :meth:`save` wrote; its postings stay mapped to the file.
+
+        Damage to the postings and descriptions is found at the first use, which raises IndexFileError too.
+
+        Raises:
+            IndexFileError: the file is missing, damaged, or was made with another vocabulary or other settings.
+        """
+        opened = index_file.load(Path(path))
+        if opened.vocabulary_hash != vocabulary.hash:
+            made, given = opened.vocabulary_hash[:16], vocabulary.hash[:16]
+            raise IndexFileError(f"{path}: made with the vocabulary {made}, not with {given}")
+        index = cls(vocabulary, config)
+        index._inverted = opened.inverted_index(vocabulary.idf)
+        for name, (kind, _) in (index._table.dtype.fields or {}).items():
+            shape = opened.array(f"table.{name}", verify=False).shape
+            if shape != (index._inverted.n_slots, *kind.shape):
+                raise IndexFileError(f"{path}: made with other settings: {name} is {shape}")
+        ids, live = opened.array("table.id"), opened.array("table.live")
+        index._slot_of = {int(ids[slot]): int(slot) for slot in np.flatnonzero(live)}
+        index._added_to = {int(session): int(count) for session, count in opened.facts["added_to"].items()}
+        index._opened = opened
+        return index
+
+    def _read_opened(self) -> None:
+        if self._opened is None:
+            return
+        with self._changing:
+            if self._opened is None:
+                return
+            self._opened.verify_postings()
+            table: NDArray[Any] = np.zeros(self._inverted.n_slots, self._table.dtype)
+            for name in table.dtype.names or ():
+                table[name] = self._opened.array(f"table.{name}")
+            self._table, self._opened = table, None
 
     def _compact(self) -> None:
         self._table = self._table[self._inverted.compact()]
@@ -107,28 +169,29 @@ class PlaceIndex:
         return _Looks(words, histograms, view.describe(observation.thumbnail))
 
     def _insert(self, observation: PlaceObservation, looks: "_Looks") -> None:
-        slot = self._inverted.add(looks.words)
-        if slot >= len(self._table):
-            more = max(64, len(self._table) // 2)
-            self._table = np.concatenate([self._table, np.zeros(more, self._table.dtype)])
-        ordinal = self._added_to.get(observation.session, 0)
-        self._table[slot] = (
-            observation.id,
-            observation.session,
-            observation.stamp_ns,
-            ordinal,
-            True,
-            looks.histograms.present,
-            looks.histograms.values,
-            looks.view.cells,
-            looks.view.totals,
-        )
-        self._added_to[observation.session] = ordinal + 1
-        self._slot_of[observation.id] = slot
+        with self._changing:
+            slot = self._inverted.add(looks.words)
+            if slot >= len(self._table):
+                more = max(64, len(self._table) // 2)
+                self._table = np.concatenate([self._table, np.zeros(more, self._table.dtype)])
+            ordinal = self._added_to.get(observation.session, 0)
+            self._table[slot] = (
+                observation.id,
+                observation.session,
+                observation.stamp_ns,
+                ordinal,
+                True,
+                looks.histograms.present,
+                looks.histograms.values,
+                looks.view.cells,
+                looks.view.totals,
+            )
+            self._added_to[observation.session] = ordinal + 1
+            self._slot_of[observation.id] = slot
 
     def _rank(self, observation: PlaceObservation, looks: "_Looks", limit: int) -> Candidates:
-        places = self._table[: self._inverted.n_slots]
         votes = self._inverted.votes(looks.words).astype(np.float64)
+        places = self._table[: len(votes)]
         jeffrey = histogram.divergence_to_all(looks.histograms, places["values"], places["present"]).astype(np.float64)
         likeness = view.likeness_to_all(looks.view, places["cells"], places["totals"]).astype(np.float64)
         score = self._fuse(votes * min(1.0, len(looks.words) / self.config.trusted_features), jeffrey, likeness)

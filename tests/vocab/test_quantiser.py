@@ -1,5 +1,8 @@
 """Nearest words through cells, at every level of the processor, against numpy."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -106,3 +109,10 @@ def test_cells_that_do_not_fit_are_refused(cells: Cells) -> None:
 def test_an_unknown_level_is_refused() -> None:
     with pytest.raises(ValueError, match="no level sse9"):
         native.Quantiser(np.zeros((1, 128), np.uint8), np.zeros((0, 128), np.uint8), np.array([0, 1]), "sse9")
+
+
+def test_missing_kernels_are_named_with_their_remedy() -> None:
+    code = "import sys; sys.modules['seamark.vocab._native'] = None; import seamark.vocab.vocabulary"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "KernelsMissingError: the compiled part of Seamark is missing" in done.stderr and "make setup" in done.stderr
