@@ -10,7 +10,7 @@ constexpr uint32_t kSmallest = 2;
 int logarithm(uint32_t size) { return 31 - __builtin_clz(size); }
 
 template <class T>
-void move(std::vector<T>& array, uint32_t from, uint32_t to, uint32_t n) {
+void move(LargeVector<T>& array, uint32_t from, uint32_t to, uint32_t n) {
     std::copy_n(array.begin() + from, n, array.begin() + to);
 }
 
@@ -56,8 +56,6 @@ ListView Head::list(int64_t l) const {
             with_signatures_ ? pool.signatures.data() + extent.start : nullptr,
             with_geometry_ ? pool.geometry.data() + extent.start : nullptr, extent.count};
 }
-
-void Head::prefetch(int64_t l) const { __builtin_prefetch(list(l).ids); }
 
 size_t Head::bytes() const {
     size_t total = extents_.size() * sizeof(Extent);

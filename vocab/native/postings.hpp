@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "kernels.hpp"
+#include "large_pages.hpp"
 
 namespace seamark {
 
@@ -57,11 +58,11 @@ struct Block {
 };
 
 struct BlockArrays {
-    std::vector<uint32_t> starts;
-    std::vector<uint16_t> ids;
-    std::vector<uint8_t> codes;
-    std::vector<uint64_t> signatures;
-    std::vector<uint16_t> geometry;
+    LargeVector<uint32_t> starts;
+    LargeVector<uint16_t> ids;
+    LargeVector<uint8_t> codes;
+    LargeVector<uint64_t> signatures;
+    LargeVector<uint16_t> geometry;
 };
 
 Block own(std::shared_ptr<BlockArrays> arrays, int64_t n_places);
@@ -82,7 +83,6 @@ public:
     void refill(const Block& block);
     void clear();
     ListView list(int64_t l) const;
-    void prefetch(int64_t l) const;
     void prefetch_header(int64_t l) const { __builtin_prefetch(&extents_[static_cast<size_t>(l)]); }
     int64_t n_places() const { return n_places_; }
     size_t bytes() const;
@@ -92,10 +92,10 @@ private:
         uint32_t start = 0, count = 0;
     };
     struct Pool {
-        std::vector<uint16_t> ids;
-        std::vector<uint8_t> codes;
-        std::vector<uint64_t> signatures;
-        std::vector<uint16_t> geometry;
+        LargeVector<uint16_t> ids;
+        LargeVector<uint8_t> codes;
+        LargeVector<uint64_t> signatures;
+        LargeVector<uint16_t> geometry;
         std::array<std::vector<uint32_t>, 32> free;  // by the logarithm of the size
         uint32_t used = 0;
     };
@@ -154,8 +154,8 @@ public:
     bool with_geometry() const { return with_geometry_; }
 
 private:
-    template <class Lists, class Each>
-    void visit(const Lists& lists, const QueryView& query, Each each) const;
+    template <class Lists>
+    void look_up(const Lists& lists, const QueryView& query, std::vector<ListView>& found) const;
     template <class Each>
     void visit_blocks(const QueryView& query, Each each) const;
     Block gather(int64_t first, int64_t n, const std::vector<int32_t>& rank, const std::vector<Block>& from) const;
