@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from seamark import SeamarkError, __version__
+from seamark.service.places_commands import places_app
 from seamark.service.terminal import Bar, errors, print_json, print_table
 
 # Everything else is imported in the command that needs it: --help must not wait for GTSAM, faiss and rerun.
@@ -30,6 +31,7 @@ synth_app = typer.Typer(no_args_is_help=True, help="Synthetic worlds with ground
 app.add_typer(vocab_app, name="vocab")
 app.add_typer(config_app, name="config")
 app.add_typer(synth_app, name="synth")
+app.add_typer(places_app, name="places")
 
 Sources = Annotated[list[str], typer.Argument(help="Folders, videos or synth:NAME, taken one after another.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]

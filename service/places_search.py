@@ -1,0 +1,180 @@
+"""Every query image against a database of images: ranked, verified, decided."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.service.places_images import DescribedImage
+from seamark.vocab import confidence, sequence
+from seamark.vocab.confidence import Verdict
+from seamark.vocab.config import VocabConfig
+from seamark.vocab.place_index import PlaceIndex
+from seamark.vocab.spatial import SUPPORT_WEIGHT, SpatialEvidence, compare
+from seamark.vocab.types import Candidate
+from seamark.vocab.vocabulary import Vocabulary
+
+VERIFIED = 20  # places of a query that are compared feature by feature
+DATABASE_SESSION, QUERY_SESSION, QUERY_ID = 0, 1, -1
+
+
+@dataclass(frozen=True)
+class Match:
+    """One place for one query: ``place`` counts the images of the database, ``score`` is higher for better ones.
+
+    ``inliers`` counts the features that agree in position; it is 0 for places that were not compared.
+    """
+
+    place: int
+    score: float
+    votes: float
+    jeffrey: float
+    inliers: int
+    accepted: bool = False
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The ranked places of one query, the probability that the first is right, and the verdict."""
+
+    matches: tuple[Match, ...]
+    probability: float
+    verdict: Verdict
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """All places for all queries: ``score``, ``votes`` and ``jeffrey`` (queries, places) float32.
+
+    The score is NaN where a place may not be asked for.
+    """
+
+    score: NDArray[np.float32]
+    votes: NDArray[np.float32]
+    jeffrey: NDArray[np.float32]
+
+
+def search(
+    database: Sequence[DescribedImage],
+    queries: Sequence[DescribedImage],
+    vocabulary: Vocabulary,
+    config: VocabConfig,
+    *,
+    top: int,
+    in_order: bool,
+    workers: int,
+) -> list[Answer]:
+    """Answer every query with ``top`` places, fewer only where the database is smaller.
+
+    ``in_order`` says that both were taken along a way, and lets neighbours count; otherwise each query is alone.
+    """
+    index = PlaceIndex(vocabulary, config)
+    for number, image in enumerate(database):
+        index.add(image.observation(number, DATABASE_SESSION))
+    table = _empty_table(len(queries), len(database))
+    for row, query in enumerate(queries):
+        _fill(table, row, index.query(query.observation(QUERY_ID, QUERY_SESSION), len(database)).ranked)
+    return _answers(table, database, queries, top, in_order, workers)
+
+
+def search_own(
+    images: Sequence[DescribedImage],
+    stamps_ns: Sequence[int],
+    vocabulary: Vocabulary,
+    config: VocabConfig,
+    *,
+    top: int,
+    in_order: bool,
+    workers: int,
+) -> tuple[list[Answer], NDArray[np.bool_]]:
+    """Answer every image of one sequence with places seen before it, the recent past excluded.
+
+    Returns the answers and (n, n) bool: which places each image might have been answered with.
+    """
+    index = PlaceIndex(vocabulary, config)
+    table = _empty_table(len(images), len(images))
+    for row, (image, stamp_ns) in enumerate(zip(images, stamps_ns, strict=True)):
+        observation = image.observation(row, DATABASE_SESSION, stamp_ns)
+        _fill(table, row, index.query(observation, max(1, len(index))).ranked)
+        index.add(observation)
+    return _answers(table, images, images, top, in_order, workers), np.isfinite(table.score)
+
+
+def _empty_table(queries: int, places: int) -> _Table:
+    score = np.full((queries, places), np.nan, np.float32)
+    return _Table(score, np.zeros_like(score), np.zeros_like(score))
+
+
+def _fill(table: _Table, row: int, ranked: Sequence[Candidate]) -> None:
+    places = [candidate.id for candidate in ranked]
+    table.score[row, places] = [candidate.score for candidate in ranked]
+    table.votes[row, places] = [candidate.votes for candidate in ranked]
+    table.jeffrey[row, places] = [candidate.jeffrey for candidate in ranked]
+
+
+def _answers(
+    table: _Table,
+    database: Sequence[DescribedImage],
+    queries: Sequence[DescribedImage],
+    top: int,
+    in_order: bool,
+    workers: int,
+) -> list[Answer]:
+    evidence = _evidence_along_ways(table.score) if in_order else None
+
+    def answer(row: int) -> Answer:
+        eligible = np.flatnonzero(np.isfinite(table.score[row]))
+        ordering = table.score[row] if evidence is None else evidence[row]
+        shortlist = eligible[np.argsort(-ordering[eligible], kind="stable")][: max(top, VERIFIED)]
+        verified = {
+            int(place): compare(queries[row].features, database[place].features) for place in shortlist[:VERIFIED]
+        }
+        score = {int(place): float(ordering[place]) for place in shortlist}
+        if evidence is None:
+            score |= {place: score[place] + SUPPORT_WEIGHT * found.support for place, found in verified.items()}
+        ranked = sorted(score, key=lambda place: (-score[place], place))[:top]
+        matches = [_match(table, row, place, score[place], verified.get(place)) for place in ranked]
+        return _decide(queries[row], matches, in_order)
+
+    with ThreadPoolExecutor(workers, thread_name_prefix="compare") as pool:
+        return list(pool.map(answer, range(len(queries))))
+
+
+def _evidence_along_ways(score: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the evidence along the best way per image: (queries, places), NaN where a place may not be asked for."""
+    known = np.where(np.isfinite(score), score, np.nan)
+    counts = np.isfinite(known).sum(axis=1, keepdims=True)
+    middle = np.nansum(known, axis=1, keepdims=True) / np.maximum(counts, 1)
+    summed = sequence.along_ways(np.where(np.isfinite(known), known, middle))
+    per_image: NDArray[np.float64] = summed / sequence.reach(len(score))[:, None]
+    return np.where(np.isfinite(score), per_image, np.nan)
+
+
+def _match(table: _Table, row: int, place: int, score: float, found: SpatialEvidence | None) -> Match:
+    inliers = 0 if found is None else found.inliers
+    return Match(place, score, float(table.votes[row, place]), float(table.jeffrey[row, place]), inliers)
+
+
+def _decide(query: DescribedImage, matches: list[Match], in_order: bool) -> Answer:
+    """Accept the first place or none."""
+    if not matches:
+        return Answer((), 0.0, Verdict.EMPTY)
+    best = matches[0]
+    if in_order:
+        probability = confidence.probability_along_way(best.score)
+    else:
+        probability = confidence.probability_single(best.score, best.inliers)
+    verdict = Verdict.ACCEPTED
+    if query.problem is not None:
+        verdict, probability = Verdict.UNREADABLE, 0.0
+    elif not in_order and not len(query.descriptors):
+        verdict, probability = Verdict.NO_FEATURES, 0.0
+    elif not in_order and best.inliers < confidence.MIN_INLIERS:
+        verdict = Verdict.FEW_INLIERS
+    elif probability < confidence.ACCEPTED_FROM:
+        verdict = Verdict.UNSURE
+    if verdict is Verdict.ACCEPTED:
+        matches[0] = Match(best.place, best.score, best.votes, best.jeffrey, best.inliers, True)
+    return Answer(tuple(matches), probability, verdict)

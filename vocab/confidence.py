@@ -1,0 +1,47 @@
+"""How sure an answer is: probabilities from the distributions of scores, and what none of them supports."""
+
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+ACCEPTED_FROM: Final = 0.95
+"""An answer at least so probable is accepted."""
+
+MIN_INLIERS: Final = 8  # unrelated images share up to seven
+
+
+class Verdict(StrEnum):
+    """What became of a query: ``accepted``, or the reason why the answer is "nothing here"."""
+
+    ACCEPTED = "accepted"
+    UNREADABLE = "unreadable"  # the image could not be read
+    EMPTY = "empty"  # there is no place to compare with
+    NO_FEATURES = "no_features"  # nothing in the image can be recognised
+    FEW_INLIERS = "few_inliers"  # the most similar place shares too few features with it
+    UNSURE = "unsure"  # the most similar place is too likely another one
+
+
+# Weights of 1, the verified score and ln(1 + inliers); found by benchmarks/calibrate_places.py, see docs/benchmarks.md.
+SINGLE: Final = (-6.911, 9.731, 1.138)
+# Weights of 1 and the mean evidence along the best way, in standard deviations per image.
+ALONG_WAY: Final = (-6.269, 2.323)
+
+
+def probability_single(score: float, inliers: int) -> float:
+    """Return how probable it is that the best place of one image is the right one (logistic regression).
+
+    ``score`` is that of the place index plus the support of its spatial evidence.
+    """
+    constant, by_score, by_inliers = SINGLE
+    return _logistic(constant + by_score * score + by_inliers * float(np.log1p(inliers)))
+
+
+def probability_along_way(evidence: float) -> float:
+    """Return how probable it is that the best place of one image of a sequence is the right one."""
+    constant, slope = ALONG_WAY
+    return _logistic(constant + slope * evidence)
+
+
+def _logistic(value: float) -> float:
+    return float(1.0 / (1.0 + np.exp(-np.clip(value, -50.0, 50.0))))
