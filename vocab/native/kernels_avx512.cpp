@@ -12,6 +12,12 @@ struct Shifted {
     alignas(64) int32_t chunks[kChunks];  // four dimensions each, less 128, as signed bytes
 };
 
+// sum += products of four unsigned and four signed bytes each. As an instruction and not an intrinsic, because GCC 12
+// copies every sum once per step around the intrinsic, which takes a third of the time.
+inline void add_products(__m512i& sum, __m512i words, __m512i chunk) {
+    asm("vpdpbusd %2, %1, %0" : "+v"(sum) : "v"(words), "v"(chunk));
+}
+
 template <int N, int G>
 void columns(const uint8_t* groups, const int32_t* bias, const Shifted* shifted, int32_t* out, int64_t stride) {
     __m512i dot[N][G];
@@ -22,7 +28,7 @@ void columns(const uint8_t* groups, const int32_t* bias, const Shifted* shifted,
         for (int g = 0; g < G; ++g) words[g] = _mm512_load_si512(groups + g * kGroupBytes + c * 4 * kGroup);
         for (int i = 0; i < N; ++i) {
             const __m512i chunk = _mm512_set1_epi32(shifted[i].chunks[c]);
-            for (int g = 0; g < G; ++g) dot[i][g] = _mm512_dpbusd_epi32(dot[i][g], words[g], chunk);
+            for (int g = 0; g < G; ++g) add_products(dot[i][g], words[g], chunk);
         }
     }
     for (int g = 0; g < G; ++g) {
