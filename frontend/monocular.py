@@ -106,7 +106,7 @@ def insert_first_keyframes(
 ) -> tuple[Filled, ...]:
     """Make the first and the newest view the first two keyframes; returns the poses of the views before the newest."""
     T_odom_first, first, live = session.T_odom_cam, initialiser.views[0], session.tracks
-    session.landmarks.set(ids, se3.transform(T_odom_first, two_view.landmarks))
+    session.landmarks.set(ids, se3.transform(T_odom_first, two_view.landmarks), np.zeros(len(ids)))
     a = builder.request(initialiser.first, session.id, None, T_odom_first, None)
     session.tracks = first.tracks[np.isin(first.tracks.ids, live.ids)]
     unknown = np.full(len(session.tracks), np.nan)

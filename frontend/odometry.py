@@ -227,11 +227,11 @@ class Frontend:
 
     def _recover(self, session: Session, frame: Frame, grey: NDArray[np.uint8]) -> Odometry:
         """Flow has failed: descriptors against recent keyframes, else lost, after a while a new session."""
-        found = recover(frame, self._builder.recent(session.id), session.camera, self._config)
+        found = recover(frame, self._builder.recent(session.id), session.camera, self._config, session.prediction())
         session.tracks = Tracks.none()
         if found is not None:
             fresh = session.new_tracks(found.pixels)
-            session.landmarks.set(fresh.ids, found.landmarks)
+            session.landmarks.set(fresh.ids, found.landmarks, found.spread)
             session.move(frame.stamp_ns, found.estimate.T_odom_cam, session.tracks)
             session.velocity = np.eye(4)
             keyframe_id = self._insert_keyframe(session, frame, grey, found.estimate.covariance)

@@ -8,9 +8,16 @@ from numpy.typing import NDArray
 
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
+from seamark.frontend.residuals import (
+    Observations,
+    discount,
+    pose_jacobian,
+    residuals_and_jacobian,
+    retract,
+    robust_weights,
+    shift_of_distance,
+)
 
-HUBER = 1.345
-CHI2_3DOF_99 = 11.34
 ITERATIONS = 8
 CONVERGED = 1e-7
 
@@ -23,26 +30,6 @@ TRANSLATION_SHARE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
-    """N landmarks seen by one camera.
-
-    ``landmarks`` (N, 3) in the odometry frame, ``pixels`` (N, 2) ideal (undistorted), ``inverse_depth`` and
-    ``inverse_sigma`` (N,) measured by the depth sensor in 1/m, NaN where it knew nothing.
-    """
-
-    landmarks: NDArray[np.float64]
-    pixels: NDArray[np.float64]
-    inverse_depth: NDArray[np.float64]
-    inverse_sigma: NDArray[np.float64]
-
-    def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "Observations":
-        """Select by mask or indices."""
-        return Observations(
-            self.landmarks[which], self.pixels[which], self.inverse_depth[which], self.inverse_sigma[which]
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """A pose with its evidence: ``inliers`` (N,) bool, median ``reprojection_px`` of them, ``covariance`` (6, 6)."""
 
@@ -50,6 +37,14 @@ class PoseEstimate:
     inliers: NDArray[np.bool_]
     reprojection_px: float
     covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where the camera is expected, ``T_odom_cam``, with the standard deviation of its position in metres."""
+
+    T_odom_cam: NDArray[np.float64]
+    sigma_m: float
 
 
 def estimate_pose(
@@ -60,17 +55,52 @@ def estimate_pose(
     iterations: int,
     pixel_sigma: float,
     minimum: int,
+    prediction: Prediction | None = None,
 ) -> PoseEstimate | None:
-    """Estimate the pose without a guess; None when fewer than ``minimum`` landmarks agree.
+    """Estimate the pose; None when fewer than ``minimum`` landmarks agree.
 
     P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`refine_pose` twice, the second time on the inliers of
-    the refined pose.
+    the refined pose. With a prediction, landmarks of uncertain distance take part: they hold the rotation, and the
+    translation across their line of sight.
     """
     if len(observations.landmarks) < max(4, minimum):
         return None
+    sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
+    starts = []
+    if len(sample) < 2 * minimum:  # too few to sample from: what is predicted is another place to start from
+        if prediction is not None:
+            starts.append((prediction.T_odom_cam, np.ones(len(observations.landmarks), bool)))
+        sample = np.arange(len(observations.landmarks))
+    starts += _sample_consensus(observations, sample, camera, threshold_px, iterations, minimum)
+    best, best_score = None, np.inf
+    for T_odom_cam, inliers in starts:
+        found = _converge(
+            T_odom_cam,
+            inliers,
+            observations,
+            camera,
+            threshold_px=threshold_px,
+            pixel_sigma=pixel_sigma,
+            minimum=minimum,
+            prediction=prediction,
+        )
+        if found is not None and found[1] < best_score:
+            best, best_score = found
+    return best
+
+
+def _sample_consensus(
+    observations: Observations,
+    sample: NDArray[np.int64],
+    camera: Camera,
+    threshold_px: float,
+    iterations: int,
+    minimum: int,
+) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    """Return the pose that most of the sample agree on, with those (N,), or nothing when fewer than the minimum do."""
     ok, rotation, translation, indices = cv2.solvePnPRansac(
-        np.ascontiguousarray(observations.landmarks),
-        np.ascontiguousarray(observations.pixels),
+        np.ascontiguousarray(observations.landmarks[sample]),
+        np.ascontiguousarray(observations.pixels[sample]),
         camera.K,
         None,
         iterationsCount=iterations,
@@ -79,85 +109,81 @@ def estimate_pose(
         flags=cv2.SOLVEPNP_AP3P,
     )
     if not ok or indices is None or len(indices) < minimum:
-        return None
-    T_cam_odom = se3.make(cv2.Rodrigues(rotation)[0], translation)
-    T_odom_cam = se3.inverse(T_cam_odom)
+        return []
     inliers = np.zeros(len(observations.landmarks), bool)
-    inliers[indices.reshape(-1)] = True
+    inliers[sample[indices.reshape(-1)]] = True
+    return [(se3.inverse(se3.make(cv2.Rodrigues(rotation)[0], translation)), inliers)]
+
+
+def _converge(
+    T_odom_cam: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
+    observations: Observations,
+    camera: Camera,
+    *,
+    threshold_px: float,
+    pixel_sigma: float,
+    minimum: int,
+    prediction: Prediction | None,
+) -> tuple[PoseEstimate, float] | None:
+    """Refine a pose on its inliers (N,), twice, as they change; return it with its truncated error."""
     covariance = np.eye(6)
     for _ in range(2):
         try:
-            T_odom_cam, covariance = refine_pose(T_odom_cam, observations[inliers], camera, pixel_sigma=pixel_sigma)
+            T_odom_cam, covariance = refine_pose(
+                T_odom_cam, observations[inliers], camera, pixel_sigma=pixel_sigma, prediction=prediction
+            )
         except np.linalg.LinAlgError:  # landmarks on one line leave the rotation about it open
             return None
-        errors, in_front = reprojection_errors(T_odom_cam, observations.landmarks, observations.pixels, camera)
+        errors, in_front = whitened_errors(T_odom_cam, observations, camera, pixel_sigma)
         inliers = in_front & (errors < threshold_px)
         if inliers.sum() < minimum:
             return None
-    return PoseEstimate(T_odom_cam, inliers, float(np.median(errors[inliers])), covariance)
+    score = float(np.where(inliers, errors, threshold_px).sum())
+    return PoseEstimate(T_odom_cam, inliers, float(np.median(errors[inliers])), covariance), score
 
 
-def reprojection_errors(
-    T_odom_cam: NDArray[np.float64], landmarks: NDArray[np.float64], pixels: NDArray[np.float64], camera: Camera
+def _as_good_as_exact(
+    observations: Observations,
+    camera: Camera,
+    threshold_px: float,
+    pixel_sigma: float,
+    prediction: Prediction | None,
+) -> NDArray[np.int64]:
+    """Return the landmarks whose uncertain distance hardly shows in the image, as indices."""
+    if observations.spread is None or prediction is None:
+        return np.arange(len(observations.landmarks))
+    in_cam = se3.transform(se3.inverse(prediction.T_odom_cam), observations.landmarks)
+    in_cam[:, 2] = np.maximum(in_cam[:, 2], 1e-3)
+    _, J_point = residuals_and_jacobian(in_cam, observations, camera, pixel_sigma)
+    shift = shift_of_distance(prediction.T_odom_cam, in_cam, observations, J_point)
+    return np.flatnonzero(np.linalg.norm(shift, axis=1) * pixel_sigma < 0.5 * threshold_px)
+
+
+def whitened_errors(
+    T_odom_cam: NDArray[np.float64], observations: Observations, camera: Camera, pixel_sigma: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the distances (N,) in pixels between landmarks and where they are seen, and which are in front."""
-    in_cam = se3.transform(se3.inverse(T_odom_cam), landmarks)
+    """Return the distances (N,) in pixels of landmarks from where they are seen, and which are in front.
+
+    What an uncertain distance explains of an error is taken off.
+    """
+    in_cam = se3.transform(se3.inverse(T_odom_cam), observations.landmarks)
     in_front = in_cam[:, 2] > 1e-3
     safe = np.where(in_front[:, None], in_cam, [0, 0, 1])
-    return np.linalg.norm(camera.project_ideal(safe) - pixels, axis=1), in_front
-
-
-def residuals_and_jacobian(
-    in_cam: NDArray[np.float64], observations: Observations, camera: Camera, pixel_sigma: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return whitened residuals (N, 3) (u, v, inverse depth) and their derivative (N, 3, 3) by the point in the camera.
-
-    Rows of an unknown inverse depth are zero.
-    """
-    x, y, z = in_cam.T
-    inverse = 1 / z
-    predicted = np.column_stack([camera.fx * x * inverse + camera.cx, camera.fy * y * inverse + camera.cy])
-    residuals = np.zeros((len(z), 3))
-    residuals[:, :2] = (predicted - observations.pixels) / pixel_sigma
-    J = np.zeros((len(z), 3, 3))
-    J[:, 0, 0] = camera.fx * inverse / pixel_sigma
-    J[:, 0, 2] = -camera.fx * x * inverse**2 / pixel_sigma
-    J[:, 1, 1] = camera.fy * inverse / pixel_sigma
-    J[:, 1, 2] = -camera.fy * y * inverse**2 / pixel_sigma
-    known = np.isfinite(observations.inverse_depth)
-    sigma = observations.inverse_sigma[known]
-    residuals[known, 2] = (inverse[known] - observations.inverse_depth[known]) / sigma
-    J[known, 2, 2] = -(inverse[known] ** 2) / sigma
-    return residuals, J
-
-
-def pose_jacobian(in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivative (N, 3, 6) of points in the camera by a right perturbation of T_odom_cam, rotation first."""
-    x, y, z = in_cam.T
-    J = np.zeros((len(in_cam), 3, 6))
-    J[:, 0, 1], J[:, 0, 2] = -z, y
-    J[:, 1, 0], J[:, 1, 2] = z, -x
-    J[:, 2, 0], J[:, 2, 1] = -y, x
-    J[:, :, 3:] = -np.eye(3)
-    return J
-
-
-def retract(T: NDArray[np.float64], delta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Apply a small tangent step (6,), rotation first, on the right."""
-    return T @ se3.make(se3.exp_rotation(delta[:3]), delta[3:])
-
-
-def robust_weights(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Huber's weights (N, 3) of whitened residuals (N, 3): one for both pixel rows, one for the depth row."""
-    pixel = np.linalg.norm(residuals[:, :2], axis=1)
-    depth = np.abs(residuals[:, 2])
-    w_pixel = np.minimum(1, HUBER / np.maximum(pixel, 1e-12))
-    w_depth = np.minimum(1, HUBER / np.maximum(depth, 1e-12))
-    return np.column_stack([w_pixel, w_pixel, w_depth])
+    residuals, J_point = residuals_and_jacobian(safe, observations, camera, pixel_sigma)
+    pixels = residuals[:, :2].copy()
+    if observations.spread is not None:
+        discount(shift_of_distance(T_odom_cam, safe, observations, J_point), pixels)
+    return np.linalg.norm(pixels, axis=1) * pixel_sigma, in_front
 
 
 def refine_pose(
-    T_odom_cam: NDArray[np.float64], observations: Observations, camera: Camera, *, pixel_sigma: float
+    T_odom_cam: NDArray[np.float64],
+    observations: Observations,
+    camera: Camera,
+    *,
+    pixel_sigma: float,
+    prediction: Prediction | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Minimise robust pixel and inverse-depth errors over the pose; return it with its covariance (6, 6).
 
@@ -169,11 +195,19 @@ def refine_pose(
         in_cam = se3.transform(se3.inverse(T), observations.landmarks)
         in_cam[:, 2] = np.maximum(in_cam[:, 2], 1e-3)
         residuals, J_point = residuals_and_jacobian(in_cam, observations, camera, pixel_sigma)
+        if observations.spread is not None:
+            shift = shift_of_distance(T, in_cam, observations, J_point)
+            discount(shift, residuals[:, :2], J_point[:, :2])
         J = J_point @ pose_jacobian(in_cam)
         weights = robust_weights(residuals)
         Jw = (J * weights[:, :, None]).reshape(-1, 6)
         H = np.asarray(Jw.T @ J.reshape(-1, 6) + 1e-9 * np.eye(6), np.float64)
-        delta = np.asarray(-np.linalg.solve(H, Jw.T @ residuals.reshape(-1)), np.float64)
+        gradient = Jw.T @ residuals.reshape(-1)
+        if prediction is not None:
+            R_cam_odom, off = T[:3, :3].T, T[:3, 3] - prediction.T_odom_cam[:3, 3]
+            gradient[3:] += R_cam_odom @ off / prediction.sigma_m**2
+            H[np.arange(3, 6), np.arange(3, 6)] += 1 / prediction.sigma_m**2
+        delta = np.asarray(-np.linalg.solve(H, gradient), np.float64)
         T = retract(T, delta)
         if float(delta @ delta) < CONVERGED**2:
             break

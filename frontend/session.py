@@ -10,14 +10,18 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.corners import detect_corners
 from seamark.frontend.depth_offset import DepthOffset
-from seamark.frontend.pose import Observations
+from seamark.frontend.pose import Prediction
+from seamark.frontend.presumed import SHARED_SPREAD, SPREAD, presume
+from seamark.frontend.residuals import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import normalised_rays, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
 
 OUTLIER_PX = 4.0
-FAR_RELATIVE_SIGMA = 0.35  # a first depth less certain than this waits for triangulation
+TRIANGULATED_SPREAD = 0.2  # a distance less certain than this is triangulated anew where two views allow it
+PREDICTION_SHARE = 0.5  # of the last step and
+PREDICTION_OF_DEPTH = 0.02  # of the depth of the scene: how far constant velocity may be wrong
 
 
 @dataclass(eq=False)
@@ -83,7 +87,18 @@ class Session:
         known = np.isfinite(positions[:, 0])
         pixels = self.camera.undistort(tracks.pixels)
         inverse_depth = self.depth_offset.correct(inverse_depth)
-        return Observations(positions[known], pixels[known], inverse_depth[known], inverse_sigma[known]), known
+        spread = self.landmarks.spread(tracks.ids[known])
+        origin = self.reference.T_odom_cam[:3, 3]
+        measured = inverse_depth[known], inverse_sigma[known]
+        return Observations(positions[known], pixels[known], *measured, spread, origin), known
+
+    def prediction(self) -> Prediction:
+        """Return where constant velocity puts the camera next, and how far that may be wrong."""
+        step = float(np.linalg.norm(self.velocity[:3, 3]))
+        positions = self.landmarks.get(self.tracks.ids)
+        distance = np.linalg.norm(positions[np.isfinite(positions[:, 0])] - self.T_odom_cam[:3, 3], axis=1)
+        depth = float(np.median(distance)) if len(distance) else 1.0
+        return Prediction(self.T_odom_cam @ self.velocity, PREDICTION_SHARE * step + PREDICTION_OF_DEPTH * depth)
 
     def revisit(self, grey: NDArray[np.uint8]) -> None:
         """Take up landmarks of archived keyframes that the current grey image shows again."""
@@ -121,6 +136,7 @@ class Session:
         del self.archive[: max(0, len(self.archive) - self.config.archive_keyframes)]
         self.adjust_window()
         self._landmarks_from_depth()  # after the adjustment: they hang on this keyframe's pose alone
+        self._landmarks_presumed()
         self.T_odom_cam = self.reference.T_odom_cam
         self.n_at_keyframe = int(np.isfinite(self.landmarks.get(self.tracks.ids)[:, 0]).sum())
         self.landmarks.retain(np.concatenate([k.track_ids for k in (*self.window, *self.archive)]))
@@ -128,16 +144,39 @@ class Session:
     def _landmarks_from_depth(self) -> None:
         newest = self.reference
         missing = np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
+        spread = newest.inverse_sigma / newest.inverse_depth
         with np.errstate(invalid="ignore"):
-            usable = missing & (newest.inverse_sigma < FAR_RELATIVE_SIGMA * newest.inverse_depth)
+            usable = missing & (spread < SPREAD)
         pixels = newest.pixels[usable]
         inverse = self.depth_offset.correct(newest.inverse_depth[usable])
         positions = se3.transform(newest.T_odom_cam, normalised_rays(pixels, self.camera) / inverse[:, None])
-        self.landmarks.set(newest.track_ids[usable], positions)
+        self.landmarks.set(newest.track_ids[usable], positions, spread[usable])
+
+    def _landmarks_presumed(self) -> None:
+        """Give the tracks that nothing is known of the distance of what is seen beside them.
+
+        They hold the rotation where a camera turns faster than it moves, until parallax tells more.
+        """
+        newest = self.reference
+        positions = self.landmarks.get(newest.track_ids)
+        missing = np.isnan(positions[:, 0])
+        known = ~missing & (self.landmarks.spread(newest.track_ids) < TRIANGULATED_SPREAD)
+        depths = se3.transform(se3.inverse(newest.T_odom_cam), positions[known])[:, 2]
+        presumed = presume(newest.pixels[missing], newest.pixels[known], depths)
+        if presumed is None:
+            return
+        rays = normalised_rays(newest.pixels[missing], self.camera)
+        positions = se3.transform(newest.T_odom_cam, rays * presumed[:, None])
+        self.landmarks.set(newest.track_ids[missing], positions, np.full(len(positions), SHARED_SPREAD))
+        if self.metric:  # a weak reading among firm ones; in mono, where there are no others, it would bend the scale
+            inverse, sigma = newest.inverse_depth.copy(), newest.inverse_sigma.copy()
+            inverse[missing], sigma[missing] = 1 / presumed, SPREAD / presumed
+            self.window[-1] = replace(newest, inverse_depth=inverse, inverse_sigma=sigma)
 
     def _landmarks_from_parallax(self) -> None:
         newest = self.reference
-        todo = np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
+        todo = ~(self.landmarks.spread(newest.track_ids) < TRIANGULATED_SPREAD)
+        todo |= np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
         for older in self.window[:-1]:  # the oldest view first: the widest angle
             shared, mine, theirs = np.intersect1d(
                 newest.track_ids, older.track_ids, assume_unique=True, return_indices=True
@@ -159,7 +198,8 @@ class Session:
                 safe = np.where(good[:, None], seen, [0, 0, 1])
                 error = np.linalg.norm(self.camera.project_ideal(safe) - keyframe.pixels[rows], axis=1)
                 good &= error < self.config.pnp_threshold_px
-            self.landmarks.set(shared[good], points[good])
+            spread = self.config.pixel_sigma / (self.camera.fx * np.maximum(angle[good], 1e-6))
+            self.landmarks.set(shared[good], points[good], spread)
             todo[mine[good]] = False
 
     def adjust_window(self) -> None:
@@ -179,7 +219,11 @@ class Session:
         starts = np.flatnonzero(np.diff(problem.landmark_of, prepend=-1))
         worst = np.maximum.reduceat(result.errors_px, starts)
         positions = np.where((worst < OUTLIER_PX)[:, None], result.landmarks, np.nan)
-        self.landmarks.set(track_ids, positions)
+        along = result.landmarks - result.poses[-1][:3, 3]
+        variance = np.einsum("li,lij,lj->l", along, result.landmark_covariances, along)
+        spread = np.sqrt(np.maximum(variance, 0)) / np.maximum((along * along).sum(axis=1), 1e-12)
+        self.landmarks.set(track_ids, positions, spread)
+        self.tracks = self.tracks[~np.isin(self.tracks.ids, track_ids[worst >= OUTLIER_PX])]
         adjusted = result.poses[len(self.anchors) :]
         self.window = [replace(k, T_odom_cam=T) for k, T in zip(self.window, adjusted, strict=True)]
         # each observation is in as many windows as there are keyframes in one

@@ -87,6 +87,7 @@ def estimate(
         iterations=c.pnp_iterations,
         pixel_sigma=c.pixel_sigma,
         minimum=c.min_inliers,
+        prediction=session.prediction(),
     )
     keep = np.ones(len(tracks), bool)
     if pose is not None:

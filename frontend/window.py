@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.depth_offset import DepthOffset
-from seamark.frontend.pose import HUBER, Observations, pose_jacobian, residuals_and_jacobian, retract, robust_weights
+from seamark.frontend.residuals import (
+    HUBER,
+    Observations,
+    pose_jacobian,
+    residuals_and_jacobian,
+    retract,
+    robust_weights,
+)
 
 INITIAL_DAMPING = 1e-4
 RELATIVE_DECREASE = 1e-4
@@ -59,12 +66,15 @@ class BundleProblem:
 class BundleResult:
     """The adjusted ``poses`` (K, 4, 4), ``landmarks`` (L, 3) and each observation's error (O,) in pixels.
 
+    ``landmark_covariances`` (L, 3, 3) take the poses for exact.
+
     ``depth_offset`` (1/m) is the sensor's, ``depth_information`` what the observations alone say about it.
     """
 
     poses: NDArray[np.float64]
     landmarks: NDArray[np.float64]
     errors_px: NDArray[np.float64]
+    landmark_covariances: NDArray[np.float64]
     depth_offset: float
     depth_information: float
 
@@ -107,12 +117,13 @@ def adjust(problem: BundleProblem, camera: Camera, *, pixel_sigma: float, iterat
                 break
         else:
             damping *= 10
+    final = _Reduced.of(problem, current, starts, 0.0, state.depth_offset)
     try:
-        information = _Reduced.of(problem, current, starts, 0.0, state.depth_offset).depth_information(problem)
+        information = final.depth_information(problem)
     except np.linalg.LinAlgError:
         information = 0.0
     poses = np.stack([se3.orthonormalise(T) for T in state.poses])
-    return BundleResult(poses, state.landmarks, current.errors_px, state.depth_offset, information)
+    return BundleResult(poses, state.landmarks, current.errors_px, final.inverse_ll, state.depth_offset, information)
 
 
 def _linearise(problem: BundleProblem, state: _State, camera: Camera, pixel_sigma: float) -> _Linearised:
@@ -227,11 +238,15 @@ class _Reduced:
 
 
 class LandmarkTable:
-    """Positions (3,) in the odometry frame by track id, NaN where unknown; as long as what it is told to keep."""
+    """Positions (3,) in the odometry frame by track id, NaN where unknown; as long as what it is told to keep.
+
+    Beside each position is its spread: the relative standard deviation of its distance from where it was seen.
+    """
 
     def __init__(self) -> None:
         self._ids = np.zeros(0, np.int64)  # ascending
         self._positions = np.zeros((0, 3))
+        self._spreads = np.zeros(0)
 
     def __len__(self) -> int:
         """Return the number of ids that are held, unknown positions included."""
@@ -240,19 +255,31 @@ class LandmarkTable:
     def get(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return positions (N, 3); forgotten and new ids are NaN."""
         out = np.full((len(track_ids), 3), np.nan)
-        if len(self._ids):
-            index = np.minimum(np.searchsorted(self._ids, track_ids), len(self._ids) - 1)
-            held = self._ids[index] == track_ids
-            out[held] = self._positions[index[held]]
+        index, held = self._find(track_ids)
+        out[held] = self._positions[index[held]]
         return out
 
-    def set(self, track_ids: NDArray[np.int64], positions: NDArray[np.float64]) -> None:
-        """Store positions (N, 3) of different ids."""
+    def spread(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the spreads (N,); forgotten and new ids are NaN."""
+        out = np.full(len(track_ids), np.nan)
+        index, held = self._find(track_ids)
+        out[held] = self._spreads[index[held]]
+        return out
+
+    def set(self, track_ids: NDArray[np.int64], positions: NDArray[np.float64], spreads: NDArray[np.float64]) -> None:
+        """Store positions (N, 3) and spreads (N,) of different ids."""
         ids = np.concatenate([track_ids, self._ids])
         self._ids, first = np.unique(ids, return_index=True)  # of an id that is held the new position comes first
         self._positions = np.vstack([positions, self._positions])[first]
+        self._spreads = np.concatenate([spreads, self._spreads])[first]
 
     def retain(self, track_ids: NDArray[np.int64]) -> None:
         """Forget all ids but these: one track that lives for ever must not keep all that came after it."""
         kept = np.isin(self._ids, track_ids)
-        self._ids, self._positions = self._ids[kept], self._positions[kept]
+        self._ids, self._positions, self._spreads = self._ids[kept], self._positions[kept], self._spreads[kept]
+
+    def _find(self, track_ids: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        if len(self._ids) == 0:
+            return np.zeros(len(track_ids), np.intp), np.zeros(len(track_ids), bool)
+        index = np.minimum(np.searchsorted(self._ids, track_ids), len(self._ids) - 1)
+        return index, self._ids[index] == track_ids

@@ -9,7 +9,9 @@ from seamark.frontend import se3
 from seamark.frontend.camera import CalibrationError, Camera, Rig
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
-from seamark.frontend.pose import Observations, estimate_pose, pose_jacobian, residuals_and_jacobian, retract
+from seamark.frontend.pose import Prediction, estimate_pose, refine_pose
+from seamark.frontend.presumed import SHARED_SPREAD, presume
+from seamark.frontend.residuals import Observations, pose_jacobian, residuals_and_jacobian, retract
 from seamark.frontend.session import Session
 from seamark.frontend.two_view import initialise, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, adjust
@@ -216,11 +218,12 @@ def test_landmark_table_holds_what_it_is_told_to_keep() -> None:
     table = LandmarkTable()
     assert np.isnan(table.get(np.array([0, 7]))).all()
     ids = np.arange(20_000)
-    table.set(ids, np.column_stack([ids, ids, ids]).astype(float))
-    table.set(np.array([15_000, 3]), np.array([[1.0, 2, 3], [4, 5, 6]]))
+    table.set(ids, np.column_stack([ids, ids, ids]).astype(float), np.full(20_000, 0.5))
+    table.set(np.array([15_000, 3]), np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([0.1, 0.2]))
     table.retain(np.array([3, 15_000, 19_999, 50_000]))
     np.testing.assert_array_equal(table.get(np.array([19_999, 3, 15_000]))[:, 0], [19_999, 4, 1])
     assert np.isnan(table.get(np.array([4, 14_999, 50_000, 10**9]))).all()
+    np.testing.assert_array_equal(table.spread(np.array([19_999, 3, 4, 15_000])), [0.5, 0.2, np.nan, 0.1])
     assert len(table) == 3
 
 
@@ -240,3 +243,45 @@ def test_a_track_that_never_ends_does_not_make_a_session_grow() -> None:
     assert session.next_track_id == 3200
     assert len(session.archive) == 2
     assert 100 < len(session.landmarks) < 400
+
+
+def test_landmarks_of_uncertain_distance_hold_the_rotation() -> None:
+    """Test: six landmarks are known, 114 only by their direction, their distances being wrong by half.
+
+    Expected: told of it, the estimate is right and far surer of the rotation than the six alone make it; not told, it
+    is wrong.
+    """
+    rng = np.random.default_rng(11)
+    points = scene(rng)
+    true = se3.make(se3.exp_rotation(np.array([0.02, 0.15, -0.03])), np.array([0.12, -0.05, 0.1]))
+    pixels = see(true, points) + 0.3 * rng.normal(size=(120, 2))
+    presumed = np.arange(120) >= 6
+    spread = np.where(presumed, SHARED_SPREAD, 0.0)
+    believed = points * np.exp(0.5 * presumed * rng.normal(size=120))[:, None]
+    unknown = np.full(120, np.nan)
+    told = Observations(believed, pixels, unknown, unknown, spread, np.zeros(3))
+    settings = {"threshold_px": 2.5, "iterations": 200, "pixel_sigma": 0.3, "minimum": 6}
+    prediction = Prediction(np.eye(4), 0.2)
+
+    def errors(T: np.ndarray) -> tuple[float, float]:
+        return float(se3.rotation_angle(T[:3, :3].T @ true[:3, :3])), float(np.linalg.norm(T[:3, 3] - true[:3, 3]))
+
+    estimate = estimate_pose(told, CAMERA, prediction=prediction, **settings)
+    six = estimate_pose(told[np.arange(6)], CAMERA, prediction=prediction, **settings)
+    assert estimate is not None and six is not None
+    rotation, translation = errors(estimate.T_odom_cam)
+    assert 0 < rotation < 2e-3
+    assert 0 < translation < 0.02
+    assert estimate.inliers.sum() > 100
+    assert np.trace(estimate.covariance[:3, :3]) < 0.3 * np.trace(six.covariance[:3, :3])
+    untold = refine_pose(true, replace(told, spread=None), CAMERA, pixel_sigma=0.3)[0]
+    assert errors(untold)[1] > 0.02
+
+
+def test_distances_are_presumed_from_what_is_seen_beside() -> None:
+    rng = np.random.default_rng(12)
+    left, right = rng.uniform(0, 100, (20, 2)), rng.uniform((500, 0), (600, 100), (20, 2))
+    known, depths = np.vstack([left, right]), np.repeat([2.0, 8.0], 20) * rng.uniform(0.9, 1.1, 40)
+    presumed = presume(np.array([[50.0, 50.0], [560.0, 40.0]]), known, depths)
+    np.testing.assert_allclose(presumed, [2, 8], rtol=0.11)
+    assert presume(np.zeros((3, 2)), known[:4], depths[:4]) is None

@@ -101,6 +101,33 @@ def test_turning_on_the_spot_invents_no_translation() -> None:
     assert all(o.outcome is Outcome.INITIALISING for o in mono)
 
 
+def test_mono_keeps_its_session_where_the_camera_turns_faster_than_it_moves() -> None:
+    """Test: after 30 frames of a walk the camera turns by 90 degrees, three a frame, a centimetre a step.
+
+    Expected: nothing that is seen at the end was seen from two places, yet there is one session, the angle is right and
+    the step has not grown.
+    """
+    walked, truth = walk("line", 30, Mode.MONO)
+    T, frames, true = truth[29], list(walked), list(truth[:30])
+    for k in range(30):
+        T = T @ se3.make(se3.exp_rotation(np.array([0.0, np.deg2rad(3.0), 0.0])), np.array([0.01, 0.0, 0.0]))
+        true.append(T)
+        stamp_ns = walked[-1].stamp_ns + (k + 1) * (walked[1].stamp_ns - walked[0].stamp_ns)
+        frames.append(Frame(30 + k, stamp_ns, WORLD.view(T)[0]))
+    odometry, _ = track(Mode.MONO, frames)
+    start = next(i for i, o in enumerate(odometry) if o.outcome is Outcome.TRACKED)
+    assert all(o.T_odom_cam is not None for o in odometry[start:])
+    assert {o.session for o in odometry} == {0}
+    estimated = np.stack([o.T_odom_cam for o in odometry[start:]])
+    turned = estimated[-31][:3, :3].T @ estimated[-1][:3, :3]
+    assert np.rad2deg(se3.rotation_angle(turned)) == pytest.approx(90, abs=1.5)
+    before, after = (
+        np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in ((estimated[0], estimated[-31]), estimated[-31::30])
+    )
+    ratio = np.linalg.norm(true[59][:3, 3] - true[29][:3, 3]) / np.linalg.norm(true[29][:3, 3] - true[start][:3, 3])
+    assert 0.3 * ratio < after / before < 3 * ratio
+
+
 def test_same_frames_same_bits() -> None:
     frames, _ = walk("loop", 15, Mode.RGBD, of=160)
     (a, keyframes_a), (b, keyframes_b) = track(Mode.RGBD, frames), track(Mode.RGBD, frames)
