@@ -3,9 +3,10 @@
     .venv/bin/python benchmarks/calibrate_places.py
 
 Pairs of image sets are rendered or generated, never photographs: the same way by day and by night, one world against
-another (everything is wrong), and generated pictures against warped ones in another light (half of them unknown). For
-the best place of each query it is known whether it is right: nearer than NEAR, or farther than FAR (between them it is
-left out). Logistic regression with both classes given the same weight; prints the weights and what they would accept.
+another (everything is wrong), both again with queries made worse (turned, small, noisy), and generated pictures against
+warped ones in another light (half of them unknown). For the best place of each query it is known whether it is right:
+nearer than NEAR, or farther than FAR (between them it is left out). Logistic regression with both classes given the
+same weight; prints the weights and what they would accept.
 """
 
 import argparse
@@ -53,16 +54,31 @@ class Set:
     name: str
     images: list[DescribedImage]
     poses: NDArray[np.float64]
+    worse: list[DescribedImage]
+
+
+def worsened(rng: np.random.Generator, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the image from another direction, through a poor camera, a third or half as large."""
+    height, width = image.shape[:2]
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    moved = corners + rng.normal(0, 0.05 * width, (1, 2)) + rng.normal(0, 0.03 * width, (4, 2))
+    H = cv2.getPerspectiveTransform(moved.astype(np.float32), corners)
+    warped = np.asarray(cv2.warpPerspective(image, H, (width, height), borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    factor = float(rng.uniform(0.3, 0.5))
+    small = cv2.resize(warped, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return photograph(rng, np.asarray(small, np.uint8))
 
 
 def rendered(name: str, count: int) -> Set:
     wanted = specification.parse(WORLDS[name])
     indices = np.unique(np.linspace(0, wanted.frames - 1, count).astype(int)).tolist()
-    config = FrontendConfig()
-    images = []
+    config, rng = FrontendConfig(), np.random.default_rng(40)
+    images, worse = [], []
     for coded in render_some(wanted, indices):
-        images.append(describe_image(sensor.decode(coded, 0, "").image, str(coded.index), config))
-    return Set(name, images, wanted.poses()[indices])
+        image = sensor.decode(coded, 0, "").image
+        images.append(describe_image(image, str(coded.index), config))
+        worse.append(describe_image(worsened(rng, image), str(coded.index), config))
+    return Set(name, images, wanted.poses()[indices], worse)
 
 
 def generated(count: int) -> tuple[Set, Set]:
@@ -82,7 +98,7 @@ def generated(count: int) -> tuple[Set, Set]:
     elsewhere = poses.copy()
     elsewhere[::2, 1, 3] = 1e6
     sets = [[describe_image(image, str(n), config) for n, image in enumerate(part)] for part in (places, queries)]
-    return Set("generated", sets[0], poses), Set("generated again", sets[1], elsewhere)
+    return Set("generated", sets[0], poses, []), Set("generated again", sets[1], elsewhere, [])
 
 
 def correctness(
@@ -132,6 +148,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     sets = {name: rendered(name, options.images) for name in WORLDS}
     pairs = [(sets[a], sets[b], True) for a, b in PAIRS]
+    pairs += [(sets[a], Set(f"{b}, worse", sets[b].worse, sets[b].poses, []), True) for a, b in PAIRS]
     pairs.append((*generated(options.images), False))
     vocabulary, config = Vocabulary.default(), VocabConfig()
     singles, ways = [], []
@@ -144,9 +161,7 @@ def main() -> None:
             answers = search(database.images, queries.images, vocabulary, config, **arguments)  # type: ignore[arg-type]
             part = list(correctness(database, queries, answers, one_world=one_world))
             found += part
-            scores = [
-                f"{np.median([a.matches[0].score for a, r in part if r == k] or [np.nan]):.3f}" for k in (True, False)
-            ]
+            scores = [f"{np.median([a.evidence for a, r in part if r == k] or [np.nan]):.3f}" for k in (True, False)]
             most = max((a.matches[0].inliers for a, r in part if not r), default=0)
             print(
                 f"{database.name} <- {queries.name}, order {in_order}: right {sum(r for _, r in part)} of {len(part)}, "
@@ -154,10 +169,10 @@ def main() -> None:
                 flush=True,
             )
     right = np.array([r for _, r in singles])
-    x = np.array([(a.matches[0].score, np.log1p(a.matches[0].inliers)) for a, _ in singles])
+    x = np.array([(a.evidence, np.log1p(a.matches[0].inliers)) for a, _ in singles])
     describe_fit("SINGLE", fit(x, right), x, right)
     right = np.array([r for _, r in ways])
-    x = np.array([(a.matches[0].score,) for a, _ in ways])
+    x = np.array([(a.evidence,) for a, _ in ways])
     describe_fit("ALONG_WAY", fit(x, right), x, right)
 
 

@@ -24,7 +24,8 @@ DATABASE_SESSION, QUERY_SESSION, QUERY_ID = 0, 1, -1
 class Match:
     """One place for one query: ``place`` counts the images of the database, ``score`` is higher for better ones.
 
-    ``inliers`` counts the features that agree in position; it is 0 for places that were not compared.
+    It compares queries too: where many places look alike, all of them score lower (confidence.doubt). ``inliers``
+    counts the features that agree in position; it is 0 for places that were not compared.
     """
 
     place: int
@@ -37,9 +38,14 @@ class Match:
 
 @dataclass(frozen=True)
 class Answer:
-    """The ranked places of one query, the probability that the first is right, and the verdict."""
+    """The ranked places of one query, the probability that the first shows the place, and the verdict.
+
+    ``evidence`` is what the probability rests on: the score of the first place before doubt was taken off, or its
+    evidence along the way.
+    """
 
     matches: tuple[Match, ...]
+    evidence: float
     probability: float
     verdict: Verdict
 
@@ -134,9 +140,10 @@ def _answers(
         score = {int(place): float(ordering[place]) for place in shortlist}
         if evidence is None:
             score |= {place: score[place] + SUPPORT_WEIGHT * found.support for place, found in verified.items()}
-        ranked = sorted(score, key=lambda place: (-score[place], place))[:top]
-        matches = [_match(table, row, place, score[place], verified.get(place)) for place in ranked]
-        return _decide(queries[row], matches, in_order)
+        ranked = sorted(score, key=lambda place: (-score[place], place))
+        off = 0.0 if in_order else confidence.doubt([score[place] for place in ranked[:VERIFIED]])
+        matches = [_match(table, row, place, score[place] - off, verified.get(place)) for place in ranked[:top]]
+        return _decide(queries[row], matches, score[ranked[0]] if ranked else 0.0, in_order)
 
     with ThreadPoolExecutor(workers, thread_name_prefix="compare") as pool:
         return list(pool.map(answer, range(len(queries))))
@@ -157,15 +164,15 @@ def _match(table: _Table, row: int, place: int, score: float, found: SpatialEvid
     return Match(place, score, float(table.votes[row, place]), float(table.jeffrey[row, place]), inliers)
 
 
-def _decide(query: DescribedImage, matches: list[Match], in_order: bool) -> Answer:
+def _decide(query: DescribedImage, matches: list[Match], evidence: float, in_order: bool) -> Answer:
     """Accept the first place or none."""
     if not matches:
-        return Answer((), 0.0, Verdict.EMPTY)
+        return Answer((), evidence, 0.0, Verdict.EMPTY)
     best = matches[0]
     if in_order:
-        probability = confidence.probability_along_way(best.score)
+        probability = confidence.probability_along_way(evidence)
     else:
-        probability = confidence.probability_single(best.score, best.inliers)
+        probability = confidence.probability_single(evidence, best.inliers)
     verdict = Verdict.ACCEPTED
     if query.problem is not None:
         verdict, probability = Verdict.UNREADABLE, 0.0
@@ -177,4 +184,4 @@ def _decide(query: DescribedImage, matches: list[Match], in_order: bool) -> Answ
         verdict = Verdict.UNSURE
     if verdict is Verdict.ACCEPTED:
         matches[0] = Match(best.place, best.score, best.votes, best.jeffrey, best.inliers, True)
-    return Answer(tuple(matches), probability, verdict)
+    return Answer(tuple(matches), evidence, probability, verdict)

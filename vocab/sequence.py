@@ -40,7 +40,7 @@ def _gather(unit: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
         before = gathered[i - 1]
         best = before - UNEVEN_STEP  # standing still
         for step, cost in ((1, 0.0), (2, UNEVEN_STEP)):
-            moved = np.full(len(before), before.min())
+            moved = np.full(len(before), -np.inf)
             if direction > 0:
                 moved[step:] = before[: max(0, len(before) - step)]
             else:
