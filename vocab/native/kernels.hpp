@@ -24,6 +24,9 @@ struct Kernels {
     // Returns the position of the smallest of n > 0 values, the first of equal ones.
     int64_t (*smallest)(const int32_t* values, int64_t n);
 
+    // Writes the positions (ascending) of the values at most `limit` and returns how many there are; room for n and 16 more.
+    int64_t (*at_most)(const int32_t* values, int64_t n, int32_t limit, int32_t* positions);
+
     // Writes the positions (ascending) and Hamming distances of the signatures at most `limit` from the query's and
     // returns how many there are. Both outputs have room for n rounded up to 8.
     int64_t (*near_signatures)(const uint64_t* signatures, int64_t n, uint64_t query, int limit, uint32_t* positions,

@@ -71,6 +71,15 @@ int64_t smallest(const int32_t* values, int64_t n) {
     return at;
 }
 
+int64_t at_most(const int32_t* values, int64_t n, int32_t limit, int32_t* positions) {
+    int64_t found = 0;
+    for (int64_t i = 0; i < n; ++i) {
+        positions[found] = static_cast<int32_t>(i);
+        found += values[i] <= limit;
+    }
+    return found;
+}
+
 int64_t near_signatures(const uint64_t* signatures, int64_t n, uint64_t query, int limit, uint32_t* positions,
                         uint8_t* distances) {
     int64_t found = 0;
@@ -85,6 +94,6 @@ int64_t near_signatures(const uint64_t* signatures, int64_t n, uint64_t query, i
 
 }  // namespace
 
-const Kernels kAvx2 = {"avx2", distances, smallest, near_signatures};
+const Kernels kAvx2 = {"avx2", distances, smallest, at_most, near_signatures};
 
 }  // namespace seamark

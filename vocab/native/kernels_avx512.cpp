@@ -79,6 +79,20 @@ int64_t smallest(const int32_t* values, int64_t n) {
     }
 }
 
+int64_t at_most(const int32_t* values, int64_t n, int32_t limit, int32_t* positions) {
+    const __m512i most = _mm512_set1_epi32(limit);
+    __m512i position = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    int64_t found = 0;
+    for (int64_t i = 0; i < n; i += 16, position = _mm512_add_epi32(position, _mm512_set1_epi32(16))) {
+        const __mmask16 inside = n - i >= 16 ? 0xffff : static_cast<__mmask16>((1u << (n - i)) - 1);
+        const __mmask16 near = _mm512_mask_cmple_epi32_mask(inside, _mm512_maskz_loadu_epi32(inside, values + i), most);
+        if (!near) continue;
+        _mm512_storeu_si512(positions + found, _mm512_maskz_compress_epi32(near, position));
+        found += __builtin_popcount(near);
+    }
+    return found;
+}
+
 int64_t near_signatures(const uint64_t* signatures, int64_t n, uint64_t query, int limit, uint32_t* positions,
                         uint8_t* distances) {
     int64_t found = 0;
@@ -100,6 +114,6 @@ int64_t near_signatures(const uint64_t* signatures, int64_t n, uint64_t query, i
 
 }  // namespace
 
-const Kernels kAvx512 = {"avx512", distances, smallest, near_signatures};
+const Kernels kAvx512 = {"avx512", distances, smallest, at_most, near_signatures};
 
 }  // namespace seamark

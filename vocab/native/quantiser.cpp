@@ -11,6 +11,7 @@ namespace seamark {
 namespace {
 
 constexpr int32_t kNever = std::numeric_limits<int32_t>::max() / 2;  // 2 sum w (d - 128) cannot overflow it
+constexpr int32_t kAnywhere = std::numeric_limits<int32_t>::max();
 constexpr int64_t kBatch = 16384;                                    // descriptors that are sorted by cell at a time
 constexpr int64_t kStretch = 16;  // groups searched by all descriptors before the next ones: 32 KiB, a first-level cache
 
@@ -82,13 +83,13 @@ void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int be
     std::vector<int32_t> scratch, which(static_cast<size_t>(n));
     std::iota(which.begin(), which.end(), 0);
     if (n_cells == 1) {
-        search(words_, 0, offsets_[1], 0, descriptors, which.data(), n, k, out, scratch);
+        search(words_, 0, offsets_[1], 0, descriptors, which.data(), n, k, kAnywhere, out, scratch);
     } else {
         std::vector<Near> cells(static_cast<size_t>(n) * beam, Near{std::numeric_limits<int32_t>::max(), -1});
-        search(coarse_, 0, n_cells, 0, descriptors, which.data(), n, beam, cells.data(), scratch);
+        search(coarse_, 0, n_cells, 0, descriptors, which.data(), n, beam, reach, cells.data(), scratch);
         const auto near = [&](size_t i) {
             const size_t nearest = i / static_cast<size_t>(beam) * static_cast<size_t>(beam);
-            return int64_t{cells[i].distance} - cells[nearest].distance <= reach;
+            return cells[i].word >= 0 && int64_t{cells[i].distance} - cells[nearest].distance <= reach;
         };
         // Sort the descriptors by cell, so that the words of a cell are read once for all of them.
         std::vector<int64_t> start(static_cast<size_t>(n_cells) + 1, 0);
@@ -103,7 +104,7 @@ void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int be
                     static_cast<int32_t>(i / static_cast<size_t>(beam));
         for (int64_t c = 0; c < n_cells; ++c)
             search(words_, first_group_[c], offsets_[c + 1] - offsets_[c], static_cast<int32_t>(offsets_[c]),
-                   descriptors, sorted.data() + start[c], start[c + 1] - start[c], k, out, scratch);
+                   descriptors, sorted.data() + start[c], start[c + 1] - start[c], k, kAnywhere, out, scratch);
     }
     for (int64_t i = 0; i < n; ++i) {
         const int32_t own = square(descriptors + i * kDescriptorSize);
@@ -113,10 +114,11 @@ void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int be
 }
 
 void Quantiser::search(const Grouped& grouped, int64_t first_group, int64_t n_words, int32_t first_word,
-                       const uint8_t* descriptors, const int32_t* which, int64_t n, int k, Near* out,
+                       const uint8_t* descriptors, const int32_t* which, int64_t n, int k, int32_t reach, Near* out,
                        std::vector<int32_t>& scratch) const {
     constexpr int64_t kWidth = kStretch * kGroup;
     scratch.resize(static_cast<size_t>(kTile * kWidth));
+    int32_t positions[kWidth + 16];
     for (int64_t from = 0; from < n_words; from += kWidth) {
         const int64_t width = std::min(kWidth, n_words - from), group = first_group + from / kGroup;
         const auto word = static_cast<int32_t>(first_word + from);
@@ -133,8 +135,10 @@ void Quantiser::search(const Grouped& grouped, int64_t first_group, int64_t n_wo
                     const auto at = static_cast<int32_t>(kernels_.smallest(row, width));
                     insert({row[at], word + at}, 1, best);
                 } else {
-                    for (int32_t at = 0; at < width; ++at)
-                        if (row[at] <= best[k - 1].distance) insert({row[at], word + at}, k, best);
+                    const int64_t farthest = int64_t{row[kernels_.smallest(row, width)]} + reach;
+                    const auto limit = static_cast<int32_t>(std::min<int64_t>(farthest, best[k - 1].distance));
+                    const int64_t found = kernels_.at_most(row, width, limit, positions);
+                    for (int64_t p = 0; p < found; ++p) insert({row[positions[p]], word + positions[p]}, k, best);
                 }
             }
         }

@@ -52,7 +52,7 @@ public:
 private:
     void assign_some(const uint8_t* descriptors, int64_t n, int k, int beam, int32_t reach, Near* out) const;
     void search(const Grouped& grouped, int64_t first_group, int64_t n_words, int32_t first_word,
-                const uint8_t* descriptors, const int32_t* which, int64_t n, int k, Near* out,
+                const uint8_t* descriptors, const int32_t* which, int64_t n, int k, int32_t reach, Near* out,
                 std::vector<int32_t>& scratch) const;
 
     const Kernels& kernels_;
