@@ -1,8 +1,8 @@
 """SAPIEN as an off-line renderer on the CPU: colour and exact depth of a world of panels.
 
 SAPIEN counts pixel centres at +0.5, so half a pixel is added to the principal point; its camera looks along x with y
-left and z up. Only this module and the probe import sapien, and only when a renderer is made. The shaders are our own
-(``shaders/``): a quarter of the cost of SAPIEN's, and they start at once.
+left and z up. Only this module, ``meshes`` and the probe import sapien, and only when a renderer is made. The shaders
+are our own (``shaders/``): a quarter of the cost of SAPIEN's, and they start at once.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth import figures
-from seamark.datasets_synth.figures import Figure, Mesh
+from seamark.datasets_synth import figures, meshes
+from seamark.datasets_synth.figures import Figure
 from seamark.datasets_synth.lighting import DAY, Illumination
 from seamark.datasets_synth.optics import GAMMA
 from seamark.datasets_synth.panels import Panel, Vector
@@ -25,7 +25,6 @@ from seamark.frontend.camera import Camera, Rig
 
 SHADERS = Path(__file__).parent / "shaders"
 NEAR_M = 0.05
-MIPMAP_LEVELS = 8
 METER_SCALE = 10  # the picture that exposure is metered on is so many times smaller
 NOWHERE = np.array([0.0, 0.0, -500.0])  # where movers wait that are not there
 LABEL_NOTHING, LABEL_STATIC, LABEL_SKY = 0, 1, 2
@@ -67,55 +66,6 @@ def _pose(T_world_cam: se3.Matrix) -> Any:
     return sapien.Pose(T_world_cam[:3, 3], [w, x, y, z])
 
 
-def _material(panel: Panel) -> Any:
-    """Return the picture of a panel as a material."""
-    import sapien.render as sr
-
-    rgba = np.ascontiguousarray(cv2.cvtColor(panel.image, cv2.COLOR_BGR2RGBA))
-    texture = sr.RenderTexture2D(
-        rgba, "R8G8B8A8Unorm", mipmap_levels=MIPMAP_LEVELS, filter_mode="linear", address_mode="mirror", srgb=True
-    )
-    material = sr.RenderMaterial()
-    if panel.sky:
-        material.base_color = [0.0, 0.0, 0.0, 1.0]
-        material.emission_texture = texture
-    else:
-        material.base_color_texture = texture
-    material.roughness = 0.95 - 0.75 * panel.gloss
-    material.specular = 0.05 + 0.95 * panel.gloss if panel.gloss > 0 else 0.0  # the shader leaves out what is matte
-    return material
-
-
-def _mesh(panels: Sequence[Panel], material: Any) -> Any:
-    """Return panels that share a picture as one mesh; row 0 of a picture is v = 0."""
-    import sapien.render as sr
-
-    picture = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
-    corners = np.concatenate([panel.corners[[3, 2, 1, 0]].astype(np.float32) for panel in panels])
-    places = np.concatenate([picture * np.array(panel.tiles, np.float32) for panel in panels])
-    normals = np.concatenate([np.tile(panel.normal.astype(np.float32), (4, 1)) for panel in panels])
-    two = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-    triangles = np.concatenate([two + np.uint32(4 * number) for number in range(len(panels))])
-    return sr.RenderShapeTriangleMesh(corners, triangles, normals, places, material)
-
-
-def _figure_mesh(mesh: Mesh) -> Any:
-    """Return a mesh of somebody in matt cloth."""
-    import sapien.render as sr
-
-    corner = np.zeros(3)
-    material = _material(Panel(corner, corner, corner, mesh.image))
-    return sr.RenderShapeTriangleMesh(mesh.vertices, mesh.triangles, mesh.normals, mesh.places, material)
-
-
-def _by_picture(panels: Sequence[Panel]) -> list[list[Panel]]:
-    """Return the panels in groups that share picture and light, in order of their first."""
-    groups: dict[tuple[int, float, bool], list[Panel]] = {}
-    for panel in panels:
-        groups.setdefault((id(panel.image), panel.glow, panel.sky), []).append(panel)
-    return list(groups.values())
-
-
 class Renderer:
     """A world in front of a rig; raises ImportError or RuntimeError where sapien or a Vulkan device is missing.
 
@@ -128,7 +78,7 @@ class Renderer:
         sapien.set_log_level("error")
         most = len(world.panels) + sum(len(part.meshes) for mover in movers for part in mover.parts) + 64
         sapien.render.set_global_config(
-            max_num_materials=most, max_num_textures=most, default_mipmap_levels=MIPMAP_LEVELS
+            max_num_materials=most, max_num_textures=most, default_mipmap_levels=meshes.MIPMAP_LEVELS
         )
         sapien.render.set_camera_shader_dir(str(SHADERS))
         self._world = world
@@ -136,11 +86,11 @@ class Renderer:
         self._scene.set_ambient_light(world.ambient)
         self._glowing: list[tuple[Any, Panel, bool]] = []  # with whether its lamp has an odd number
         self._labels = np.zeros(1, np.uint8)
-        for group in _by_picture(world.panels):
+        for group in meshes.by_picture(world.panels):
             self._add([group], LABEL_SKY if group[0].sky and world.sun is not None else LABEL_STATIC)
         self._movers = [
             [
-                self._enter([_figure_mesh(mesh) for mesh in part.meshes], figures.label(k, number))
+                self._enter([meshes.figure_mesh(mesh) for mesh in part.meshes], figures.label(k, number))
                 for number, part in enumerate(mover.parts)
             ]
             for k, mover in enumerate(movers)
@@ -161,22 +111,22 @@ class Renderer:
         self._T_left_right = rig.T_cam0_cam1
 
     def _add(self, groups: Sequence[Sequence[Panel]], label: int) -> Any:
-        meshes = []
+        shapes = []
         for group in groups:
-            material = _material(group[0])
+            material = meshes.material_of(group[0])
             if group[0].glow > 0 or group[0].sky:
                 self._glowing.append((material, group[0], len(group) == 1 and self._is_odd(group[0])))
                 self._glow(*self._glowing[-1], DAY)
-            meshes.append(_mesh(group, material))
-        return self._enter(meshes, label)
+            shapes.append(meshes.panel_mesh(group, material))
+        return self._enter(shapes, label)
 
-    def _enter(self, meshes: Sequence[Any], label: int) -> Any:
-        """Put meshes into the scene as one thing."""
+    def _enter(self, shapes: Sequence[Any], label: int) -> Any:
+        """Put shapes into the scene as one thing."""
         import sapien
 
         entity, body = sapien.Entity(), sapien.render.RenderBodyComponent()
-        for mesh in meshes:
-            body.attach(mesh)
+        for shape in shapes:
+            body.attach(shape)
         entity.add_component(body)
         self._scene.add_entity(entity)
         if entity.per_scene_id >= len(self._labels):
