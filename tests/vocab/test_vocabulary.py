@@ -32,7 +32,7 @@ def test_assign_is_the_nearest_word(seed: int, n_words: int, n: int) -> None:
 
 @pytest.mark.parametrize("batch", [1, 7, 19, 20, 21, 300])
 def test_of_equally_near_words_the_lowest_wins_in_batches_of_any_size(batch: int) -> None:
-    """faiss takes another path for few queries; the answer must not depend on it."""
+    """Descriptors are compared four at a time; the answer must not depend on who is beside them."""
     words = make(3, 200).words.copy()
     words[100:] = words[:100]
     vocabulary = Vocabulary(words, np.ones(200, np.float32))
