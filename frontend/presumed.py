@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 NEIGHBOURS = 5
 SPREAD = 0.5  # relative standard deviation of a presumed distance
-SHARED_SPREAD = 5.0  # what to reckon with where many are used at once: neighbours err together
 
 
 def presume(

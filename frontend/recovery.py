@@ -11,7 +11,7 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import extract_features, match_descriptors
 from seamark.frontend.pose import PoseEstimate, Prediction, estimate_pose
-from seamark.frontend.presumed import SHARED_SPREAD, presume
+from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.residuals import Observations
 from seamark.frontend.types import Frame, Keyframe
 
@@ -74,5 +74,5 @@ def _landmarks(
     presumed = presume(points[chosen[missing]], points[known], keyframe.landmarks[known, 2])
     if presumed is not None:
         landmarks[missing] = camera.rays(points[chosen[missing]]) * presumed[:, None]
-        spread[missing] = SHARED_SPREAD
+        spread[missing] = SPREAD
     return landmarks, spread

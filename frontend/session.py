@@ -11,7 +11,7 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.corners import detect_corners
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.pose import Prediction
-from seamark.frontend.presumed import SHARED_SPREAD, SPREAD, presume
+from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.residuals import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import Tracks
@@ -167,7 +167,7 @@ class Session:
             return
         rays = normalised_rays(newest.pixels[missing], self.camera)
         positions = se3.transform(newest.T_odom_cam, rays * presumed[:, None])
-        self.landmarks.set(newest.track_ids[missing], positions, np.full(len(positions), SHARED_SPREAD))
+        self.landmarks.set(newest.track_ids[missing], positions, np.full(len(positions), SPREAD))
         if self.metric:  # a weak reading among firm ones; in mono, where there are no others, it would bend the scale
             inverse, sigma = newest.inverse_depth.copy(), newest.inverse_sigma.copy()
             inverse[missing], sigma[missing] = 1 / presumed, SPREAD / presumed

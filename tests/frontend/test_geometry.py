@@ -10,7 +10,7 @@ from seamark.frontend.camera import CalibrationError, Camera, Rig
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.pose import Prediction, estimate_pose, refine_pose
-from seamark.frontend.presumed import SHARED_SPREAD, presume
+from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.residuals import Observations, pose_jacobian, residuals_and_jacobian, retract
 from seamark.frontend.session import Session
 from seamark.frontend.two_view import initialise, triangulate
@@ -246,7 +246,7 @@ def test_a_track_that_never_ends_does_not_make_a_session_grow() -> None:
 
 
 def test_landmarks_of_uncertain_distance_hold_the_rotation() -> None:
-    """Test: six landmarks are known, 114 only by their direction, their distances being wrong by half.
+    """Test: six landmarks are known, 114 only by their direction, their distances being wrong by a fifth.
 
     Expected: told of it, the estimate is right and far surer of the rotation than the six alone make it; not told, it
     is wrong.
@@ -256,8 +256,8 @@ def test_landmarks_of_uncertain_distance_hold_the_rotation() -> None:
     true = se3.make(se3.exp_rotation(np.array([0.02, 0.15, -0.03])), np.array([0.12, -0.05, 0.1]))
     pixels = see(true, points) + 0.3 * rng.normal(size=(120, 2))
     presumed = np.arange(120) >= 6
-    spread = np.where(presumed, SHARED_SPREAD, 0.0)
-    believed = points * np.exp(0.5 * presumed * rng.normal(size=120))[:, None]
+    spread = np.where(presumed, SPREAD, 0.0)
+    believed = points * np.exp(0.2 * presumed * rng.normal(size=120))[:, None]
     unknown = np.full(120, np.nan)
     told = Observations(believed, pixels, unknown, unknown, spread, np.zeros(3))
     settings = {"threshold_px": 2.5, "iterations": 200, "pixel_sigma": 0.3, "minimum": 6}
