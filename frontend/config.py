@@ -59,6 +59,12 @@ class FrontendConfig(BaseModel):
     initial_min_landmarks: int = Field(50, ge=10, description="landmarks of a first map at least")
     triangulation_min_angle_deg: float = Field(0.9, gt=0, description="angle between the rays to a new landmark")
 
+    # Stamps
+    clock_back_frames: int = Field(
+        5, ge=2, description="frames in ascending order before the newest stamp: the clock was set back"
+    )
+    clock_jump_s: float = Field(10.0, gt=0, description="a stamp farther ahead waits for the next to confirm it")
+
     # Loss and recovery
     patience_s: float = Field(0.6, gt=0, description="sensor time without a pose after which a new session starts")
     recovery_keyframes: int = Field(3, ge=1, le=20, description="recent keyframes tried by descriptors when flow fails")

@@ -2,27 +2,26 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.frontend import se3, tracker
-from seamark.frontend.admission import refusal
+from seamark.frontend.admission import StampGate, refusal
 from seamark.frontend.camera import CalibrationError
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import NoDepth, make_depth_sensor
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import grey_of
 from seamark.frontend.keyframes import KeyframeBuilder
+from seamark.frontend.loss import MIN_CORNERS, loss_of
 from seamark.frontend.monocular import MonoInitialiser, insert_first_keyframes
 from seamark.frontend.pose import PoseEstimate, motion_covariance
 from seamark.frontend.recovery import recover
 from seamark.frontend.session import Session
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.types import Frame, Keyframe, Mode, Odometry, Outcome, Quality, Rig
-
-MIN_CORNERS = 40  # a session needs something to see
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +69,20 @@ class Frontend:
         self._session: Session | None = None
         self._initialiser: MonoInitialiser | None = None
         self._grey: NDArray[np.uint8] | None = None
-        self._last_stamp_ns: int | None = None
+        self._stamps = StampGate(mode, config)
         self._next_session = 0
         self._T_odom_start = se3.T_WORLD_LEVEL_CAM.copy()
 
     def step(self, frame: Frame) -> FrontendResult:
         """Process one frame; frames come in the order of their stamps."""
-        refused = self._refuse(frame)
-        if refused is not None:
+        refused = refusal(frame, self._rig, self._mode) or self._stamps.admit(frame.stamp_ns)
+        if refused is not None and refused is not Outcome.CLOCK_RESET:
             odometry = report(frame, refused, Quality.LOST)
         elif self._mode is Mode.PLACES:
             odometry = self._place(frame)
+        elif refused is Outcome.CLOCK_RESET:
+            self._end_session()
+            odometry = replace(self._follow(frame), outcome=Outcome.CLOCK_RESET)
         else:
             odometry = self._follow(frame)
         return FrontendResult(odometry, self._builder.take())
@@ -93,17 +95,6 @@ class Frontend:
     def close(self) -> None:
         """Stop the keyframe thread."""
         self._builder.close()
-
-    def _refuse(self, frame: Frame) -> Outcome | None:
-        """Return why a frame cannot be used, or None and take its stamp as the newest."""
-        outcome = refusal(frame, self._rig, self._mode)
-        if outcome is not None:
-            return outcome
-        last = self._last_stamp_ns
-        if last is not None and frame.stamp_ns <= last:
-            return Outcome.REPEATED_STAMP if frame.stamp_ns == last else Outcome.STAMP_BACKWARD
-        self._last_stamp_ns = frame.stamp_ns
-        return None
 
     def _place(self, frame: Frame) -> Odometry:
         request = self._builder.request(frame, session=0)
@@ -171,7 +162,7 @@ class Frontend:
         usable = len(session.tracks) if mono else int(np.isfinite(inverse).sum())
         if usable < MIN_CORNERS:
             self._session = None
-            return report(frame, Outcome.LOST, Quality.LOST)
+            return report(frame, Outcome.LOST, Quality.LOST, loss=loss_of(grey, self._config.min_corner_response))
         self._session = session
         session.last_pose_stamp_ns = frame.stamp_ns
         self._next_session += 1
@@ -239,10 +230,21 @@ class Frontend:
             return self._tracked(session, frame, found.estimate, Outcome.RECOVERED, keyframe_id, arrows, {})
         session.velocity = np.eye(4)
         if frame.stamp_ns - session.last_pose_stamp_ns < 1e9 * self._config.patience_s:
-            return report(frame, Outcome.LOST, Quality.LOST, session=session.id)
-        self._T_odom_start, self._depth_offset = session.T_odom_cam, session.depth_offset
-        self._session = None
+            return report(
+                frame,
+                Outcome.LOST,
+                Quality.LOST,
+                session=session.id,
+                loss=loss_of(grey, self._config.min_corner_response),
+            )
+        self._end_session()
         return self._start(frame, grey)
+
+    def _end_session(self) -> None:
+        """Leave the session; odometry of the next one goes on from where this one was."""
+        if self._session is not None:
+            self._T_odom_start, self._depth_offset = self._session.T_odom_cam, self._session.depth_offset
+        self._session = self._initialiser = None
 
     def _tracked(
         self,

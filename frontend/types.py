@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from seamark.frontend.camera import Camera, Rig
 
-__all__ = ["Camera", "Features", "Filled", "Frame", "Keyframe", "Mode", "Odometry", "Outcome", "Quality", "Rig"]
+__all__ = ["Camera", "Features", "Filled", "Frame", "Keyframe", "Loss", "Mode", "Odometry", "Outcome", "Quality", "Rig"]
 
 FloatArray = NDArray[np.floating]
 Matrix = NDArray[np.float64]
@@ -53,7 +53,18 @@ class Outcome(StrEnum):
     UNREADABLE = "unreadable"  # missing, truncated or undecodable file, or a picture of a wrong type
     WRONG_SIZE = "wrong_size"  # an image contradicts the calibration, or depth its image
     REPEATED_STAMP = "repeated_stamp"
-    STAMP_BACKWARD = "stamp_backward"
+    STAMP_BACKWARD = "stamp_backward"  # before the newest stamp
+    STAMP_FORWARD = "stamp_forward"  # far after it, and the first to say so
+    CLOCK_RESET = "clock_reset"  # the first frame believed after the clock was set back: of a new session
+
+
+class Loss(StrEnum):
+    """Why a frame that could be used has no pose (outcome LOST, or CLOCK_RESET with nothing to see)."""
+
+    DARK = "dark"  # nearly all of the image is black
+    BRIGHT = "bright"  # most of the image is blown out
+    FEATURELESS = "featureless"  # too few corners: a wall, a covered lens
+    UNMATCHED = "unmatched"  # enough to see, but nothing of it was known
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +73,8 @@ class Frame:
 
     ``image`` is (H, W) grey or (H, W, 3) BGR, uint8. ``image_right`` is (H, W) or (H, W, 3) uint8 for stereo. ``depth``
     is (H, W) along the optical axis of ``image``: float32 metres, or uint16 in units of 1 / ``rig.depth_factor``
-    metres; zero and non-finite mean unknown. ``file`` names the frame in reports.
+    metres; zero and non-finite mean unknown. ``file`` names the frame in reports. ``mask`` (H, W) uint8 is zero where
+    the image must not be used: nothing is tracked or remembered there.
     """
 
     index: int
@@ -71,6 +83,7 @@ class Frame:
     image_right: NDArray[np.uint8] | None = None
     depth: NDArray[np.uint16] | NDArray[np.float32] | None = None
     file: str = ""
+    mask: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +161,11 @@ class Odometry:
     the frame belongs to none. ``covariance`` (6, 6) is of the motion since the reference keyframe. ``filled`` gives
     poses of earlier frames that became known with this one. ``inliers`` counts landmarks that the pose rests on and
     ``reprojection_px`` is their median error, NaN where none was measured: no pose, or the first of a session.
-    ``tracks`` (M, 4) float32 are the inlier tracks (x, y, x_before, y_before) in pixels, for people.
+    ``near_share`` is the share of the inliers whose distance is known to better than a tenth: these hold the
+    translation, the others only the rotation. ``loss`` says why there is no pose where one could have been. ``tracks``
+    (M, 4) float32 are the inlier tracks (x, y, x_before, y_before) in pixels, for people, and ``track_ages`` (M,) int32
+    for how many posed frames they have lived. ``motion_mask`` (h, w) uint8, made while the camera stands still, is 255
+    where something moves; one element is for a square of pixels (see motion_mask.py).
     """
 
     index: int
@@ -168,3 +185,7 @@ class Odometry:
     filled: tuple[Filled, ...] = ()
     tracks: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 4), np.float32))
     stages_ms: dict[str, float] = field(default_factory=dict)
+    near_share: float | None = None
+    loss: Loss | None = None
+    track_ages: NDArray[np.int32] | None = None
+    motion_mask: NDArray[np.uint8] | None = None

@@ -43,7 +43,7 @@ class Camera(_message.Message):
     def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., distortion: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("schema_version", "index", "stamp_ns", "file", "image", "image_right", "depth")
+    __slots__ = ("schema_version", "index", "stamp_ns", "file", "image", "image_right", "depth", "mask")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     INDEX_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
@@ -51,6 +51,7 @@ class Frame(_message.Message):
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_RIGHT_FIELD_NUMBER: _ClassVar[int]
     DEPTH_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     index: int
     stamp_ns: int
@@ -58,7 +59,8 @@ class Frame(_message.Message):
     image: Image
     image_right: Image
     depth: Image
-    def __init__(self, schema_version: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., image: _Optional[_Union[Image, _Mapping]] = ..., image_right: _Optional[_Union[Image, _Mapping]] = ..., depth: _Optional[_Union[Image, _Mapping]] = ...) -> None: ...
+    mask: Image
+    def __init__(self, schema_version: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., image: _Optional[_Union[Image, _Mapping]] = ..., image_right: _Optional[_Union[Image, _Mapping]] = ..., depth: _Optional[_Union[Image, _Mapping]] = ..., mask: _Optional[_Union[Image, _Mapping]] = ...) -> None: ...
 
 class Features(_message.Message):
     __slots__ = ("points", "scales", "angles", "descriptors")
@@ -129,7 +131,7 @@ class Stage(_message.Message):
     def __init__(self, name: _Optional[str] = ..., ms: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Odometry(_message.Message):
-    __slots__ = ("schema_version", "index", "stamp_ns", "file", "session", "quality", "outcome", "inliers", "reprojection_px", "latency_ms", "T_odom_cam", "reference_id", "T_reference_cam", "covariance", "keyframe_id", "filled", "tracks", "stages_ms")
+    __slots__ = ("schema_version", "index", "stamp_ns", "file", "session", "quality", "outcome", "inliers", "reprojection_px", "latency_ms", "T_odom_cam", "reference_id", "T_reference_cam", "covariance", "keyframe_id", "filled", "tracks", "stages_ms", "near_share", "loss", "track_ages", "motion_mask")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     INDEX_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
@@ -148,6 +150,10 @@ class Odometry(_message.Message):
     FILLED_FIELD_NUMBER: _ClassVar[int]
     TRACKS_FIELD_NUMBER: _ClassVar[int]
     STAGES_MS_FIELD_NUMBER: _ClassVar[int]
+    NEAR_SHARE_FIELD_NUMBER: _ClassVar[int]
+    LOSS_FIELD_NUMBER: _ClassVar[int]
+    TRACK_AGES_FIELD_NUMBER: _ClassVar[int]
+    MOTION_MASK_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     index: int
     stamp_ns: int
@@ -166,7 +172,11 @@ class Odometry(_message.Message):
     filled: _containers.RepeatedCompositeFieldContainer[Filled]
     tracks: Array
     stages_ms: _containers.RepeatedCompositeFieldContainer[Stage]
-    def __init__(self, schema_version: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., session: _Optional[int] = ..., quality: _Optional[str] = ..., outcome: _Optional[str] = ..., inliers: _Optional[int] = ..., reprojection_px: _Optional[float] = ..., latency_ms: _Optional[float] = ..., T_odom_cam: _Optional[_Union[Array, _Mapping]] = ..., reference_id: _Optional[int] = ..., T_reference_cam: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., keyframe_id: _Optional[int] = ..., filled: _Optional[_Iterable[_Union[Filled, _Mapping]]] = ..., tracks: _Optional[_Union[Array, _Mapping]] = ..., stages_ms: _Optional[_Iterable[_Union[Stage, _Mapping]]] = ...) -> None: ...
+    near_share: float
+    loss: str
+    track_ages: Array
+    motion_mask: Array
+    def __init__(self, schema_version: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., session: _Optional[int] = ..., quality: _Optional[str] = ..., outcome: _Optional[str] = ..., inliers: _Optional[int] = ..., reprojection_px: _Optional[float] = ..., latency_ms: _Optional[float] = ..., T_odom_cam: _Optional[_Union[Array, _Mapping]] = ..., reference_id: _Optional[int] = ..., T_reference_cam: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., keyframe_id: _Optional[int] = ..., filled: _Optional[_Iterable[_Union[Filled, _Mapping]]] = ..., tracks: _Optional[_Union[Array, _Mapping]] = ..., stages_ms: _Optional[_Iterable[_Union[Stage, _Mapping]]] = ..., near_share: _Optional[float] = ..., loss: _Optional[str] = ..., track_ages: _Optional[_Union[Array, _Mapping]] = ..., motion_mask: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class PlaceObservation(_message.Message):
     __slots__ = ("schema_version", "id", "session", "stamp_ns", "descriptors", "points", "thumbnail")

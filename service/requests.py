@@ -17,7 +17,7 @@ DepthPicture = bytes | NDArray[np.uint16] | NDArray[np.float32]
 class EncodedFrame:
     """A :class:`seamark.frontend.types.Frame` of which at least one picture is still JPEG or PNG bytes.
 
-    ``image`` and ``image_right`` are bytes or the arrays of Frame; ``depth`` is a 16-bit PNG or the array of Frame.
+    ``image``, ``image_right`` and ``mask`` are bytes or the arrays of Frame; ``depth`` is a 16-bit PNG or its array.
     """
 
     index: int
@@ -26,6 +26,7 @@ class EncodedFrame:
     image_right: Picture | None = None
     depth: DepthPicture | None = None
     file: str = ""
+    mask: Picture | None = None
 
 
 class PlaceError(StrEnum):

@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError, Message
 
 from seamark import SeamarkError
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
-from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Odometry, Outcome, Quality
+from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Loss, Odometry, Outcome, Quality
 from seamark.service import messages_pb2 as pb
 from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery, PlaceReply, Status
 from seamark.service.wire_fields import (
@@ -74,7 +74,7 @@ class Schema:
 
 
 def _frame(**fields: Any) -> Frame | EncodedFrame:
-    pictures = (fields["image"], fields["image_right"], fields["depth"])
+    pictures = (fields[name] for name in ("image", "image_right", "depth", "mask"))
     return EncodedFrame(**fields) if any(isinstance(picture, bytes) for picture in pictures) else Frame(**fields)
 
 
@@ -169,6 +169,7 @@ _FRAME = Schema(
         "image": Picture(_COLOUR),
         "image_right": Optional(Picture(_COLOUR)),
         "depth": Optional(Picture(Array(("uint16", "float32"), (None, None)))),
+        "mask": Optional(Picture(Array(("uint8",), (None, None)))),
     },
     _frame,
 )
@@ -211,6 +212,10 @@ SCHEMAS: dict[type, Schema] = {
             "filled": Repeated(_FILLED),
             "tracks": Array(("float32",), (None, 4)),
             "stages_ms": Map("ms", number=True),
+            "near_share": Optional(Number()),
+            "loss": Optional(Word(Loss)),
+            "track_ages": Optional(Array(("int32",), (None,))),
+            "motion_mask": Optional(Array(("uint8",), (None, None))),
         },
         Odometry,
     ),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.frontend.features import grey_of
 from seamark.frontend.odometry import Frontend
 from seamark.frontend.types import Frame, Keyframe, Odometry, Outcome, Quality
 from seamark.service import topics
@@ -65,6 +66,8 @@ class FrontendNode:
             self._bus.publish(topics.ODOMETRY, odometry)
         self._meter.count("frames")
         self._meter.count(f"frames_{odometry.outcome}")
+        if odometry.loss is not None:
+            self._meter.count(f"lost_{odometry.loss}")
         self._meter.add(odometry.stages_ms)
         return odometry
 
@@ -125,6 +128,7 @@ def decode_frame(frame: Frame | EncodedFrame) -> Frame:
         image_right=None if frame.image_right is None else _decode_image(frame.image_right, name),
         depth=None if frame.depth is None else _decode_depth(frame.depth, name),
         file=frame.file,
+        mask=None if frame.mask is None else grey_of(_decode_image(frame.mask, name)),
     )
 
 

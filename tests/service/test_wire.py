@@ -91,9 +91,9 @@ def messages() -> list[Any]:
     return [
         Frame(0, 10, grey),
         Frame(1, 11, np.stack([grey] * 3, axis=-1), grey, np.array([[0, np.nan]], np.float32), "f"),
-        Frame(2, 12, grey, None, grey.astype(np.uint16)),
+        Frame(2, 12, grey, None, grey.astype(np.uint16), mask=grey),
         EncodedFrame(3, 13, b"jpeg", None, b"png", "g"),
-        EncodedFrame(4, 14, grey, b"right", None),
+        EncodedFrame(4, 14, grey, b"right", None, mask=b"png"),
         keyframe(),
         bare,
         odometry(),
