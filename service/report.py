@@ -38,6 +38,7 @@ def build_report(record: RunRecord, config: SeamarkConfig) -> dict[str, Any]:
             "in_trajectory": len(corrected),
             "by_outcome": _counts(frame.outcome.value for frame in record.odometry),
             "by_quality": _counts(frame.quality.value for frame in record.odometry),
+            "by_loss": _counts(frame.loss.value for frame in record.odometry if frame.loss is not None),
         },
         "duration_s": _duration_s(record.odometry),
         "lost_spans": lost_spans(record.odometry),
@@ -95,24 +96,29 @@ def compare(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> di
 
 
 def lost_spans(odometry: Sequence[Odometry]) -> list[dict[str, Any]]:
-    """Return the runs of frames without a pose: stamps of first and last frame, their number, what happened."""
-    spans: list[list[Odometry]] = []
-    open_span = False
+    """Return the runs of frames without a pose: stamps of first and last frame, their number, what happened, why, and
+    the outcome of the frame that ended it (None: the end of the run).
+    """
+    spans: list[tuple[list[Odometry], str | None]] = []
+    span: list[Odometry] = []
     for frame in odometry:
-        lost = frame.T_odom_cam is None and frame.outcome not in NOT_LOST
-        if lost and open_span:
-            spans[-1].append(frame)
-        elif lost:
-            spans.append([frame])
-        open_span = lost
+        if frame.T_odom_cam is None and frame.outcome not in NOT_LOST:
+            span.append(frame)
+        elif span:
+            spans.append((span, frame.outcome.value))
+            span = []
+    if span:
+        spans.append((span, None))
     return [
         {
             "from": format_stamp(span[0].stamp_ns),
             "to": format_stamp(span[-1].stamp_ns),
             "frames": len(span),
             "by_outcome": _counts(frame.outcome.value for frame in span),
+            "by_loss": _counts(frame.loss.value for frame in span if frame.loss is not None),
+            "ended_by": ended_by,
         }
-        for span in spans
+        for span, ended_by in spans
     ]
 
 

@@ -22,7 +22,10 @@ from seamark.service.types import KeyframeSummary, RunRecord, Trajectory
 __all__ = ["FRAME_COLUMNS", "LOOP_COLUMNS", "TUM_HEADER", "Output", "OutputError", "prepare_output", "write_results"]
 
 TUM_HEADER = "# stamp tx ty tz qx qy qz qw"
-FRAME_COLUMNS = ("stamp", "file", "session", "quality", "inliers", "reprojection_px", "latency_ms", "outcome")
+FRAME_COLUMNS = (
+    *("stamp", "file", "session", "quality", "inliers", "reprojection_px", "latency_ms", "outcome"),
+    *("loss", "near_share"),
+)
 LOOP_COLUMNS = (
     *("query_stamp", "match_stamp", "query_file", "match_file", "accepted", "reason"),
     *("score", "votes", "jeffrey", "inliers", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
@@ -95,6 +98,8 @@ def frame_row(frame: Odometry, *, timed: bool = True) -> list[str]:
         number(frame.reprojection_px, 6),
         number(frame.latency_ms, 6) if timed else "",
         frame.outcome.value,
+        "" if frame.loss is None else frame.loss.value,
+        "" if frame.near_share is None else number(frame.near_share, 3),
     ]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from seamark.backend.types import Loop, MapSnapshot, Reason
 from seamark.frontend import se3
-from seamark.frontend.types import Filled, Mode, Odometry, Outcome, Quality
+from seamark.frontend.types import Filled, Loss, Mode, Odometry, Outcome, Quality
 from seamark.service.types import KeyframeSummary, ProcessUsage, RunRecord, Trajectory
 
 START_NS = 1_700_000_000_000_000_001
@@ -32,7 +32,8 @@ def odometry(k: int) -> Odometry:
     stamp, file = START_NS + k * STEP_NS, f"rgb/{k:03d}.png"
     if k in (30, 31):
         outcome = Outcome.UNREADABLE if k == 30 else Outcome.LOST
-        return Odometry(k, stamp, file, -1 if k == 30 else 0, Quality.LOST, outcome)
+        loss = None if k == 30 else Loss.DARK
+        return Odometry(k, stamp, file, -1 if k == 30 else 0, Quality.LOST, outcome, loss=loss)
     reference = k - k % KEYFRAME_EVERY if k not in (32, 33, 34) else 25
     T, T_reference = drifted_pose(k), drifted_pose(reference)
     return Odometry(

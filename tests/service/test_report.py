@@ -23,12 +23,15 @@ def test_every_item(make_record: MakeRecord) -> None:
     assert report["frames"]["total"] == 62
     assert report["frames"]["tracked"] == report["frames"]["in_trajectory"] == 60
     assert report["frames"]["by_outcome"] == {"lost": 1, "new_session": 1, "tracked": 59, "unreadable": 1}
+    assert report["frames"]["by_loss"] == {"dark": 1}
     assert report["lost_spans"] == [
         {
             "from": "1700000003.000000001",
             "to": "1700000003.100000001",
             "frames": 2,
             "by_outcome": {"lost": 1, "unreadable": 1},
+            "by_loss": {"dark": 1},
+            "ended_by": "tracked",
         }
     ]
     assert report["sessions"] == [{"id": 0, "frames": 61, "keyframes": 12, "component": 0, "in_trajectory": True}]
@@ -75,7 +78,7 @@ def test_spans_end_where_a_pose_is_found(make_record: MakeRecord) -> None:
     frames = make_record().odometry
     assert lost_spans(frames[:30]) == []
     twice = (*frames[29:33], *frames[30:32])
-    assert [span["frames"] for span in lost_spans(twice)] == [2, 2]
+    assert [(span["frames"], span["ended_by"]) for span in lost_spans(twice)] == [(2, "tracked"), (2, None)]
     assert lost_spans(make_record(Mode.MONO).odometry[:5]) == []
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from seamark.backend.types import Loop, Reason
 from seamark.frontend import se3
-from seamark.frontend.types import Mode, Odometry, Outcome, Quality
+from seamark.frontend.types import Loss, Mode, Odometry, Outcome, Quality
 from seamark.service import trajectories
 from seamark.service.config import load_config
 from seamark.service.evaluation import ate, load_tum
@@ -51,10 +51,13 @@ class TestGoldenFormats:
 
     def test_frame_rows(self) -> None:
         frame = Odometry(3, 1_500_000_000, "rgb/a,b.png", 0, Quality.GOOD, Outcome.TRACKED, 87, 0.123456789, 9.87654321)
-        assert frame_row(frame) == ["1.500000000", "rgb/a,b.png", "0", "good", "87", "0.123457", "9.87654", "tracked"]
+        row = ["1.500000000", "rgb/a,b.png", "0", "good", "87", "0.123457", "9.87654", "tracked"]
+        assert frame_row(frame) == [*row, "", ""]
+        assert frame_row(replace(frame, near_share=0.98765))[8:] == ["", "0.988"]
         assert frame_row(frame, timed=False)[6] == ""
         lost = Odometry(4, 2_000_000_000, "x", -1, Quality.LOST, Outcome.UNREADABLE)
-        assert frame_row(lost) == ["2.000000000", "x", "-1", "lost", "0", "", "", "unreadable"]
+        assert frame_row(lost) == ["2.000000000", "x", "-1", "lost", "0", "", "", "unreadable", "", ""]
+        assert frame_row(replace(lost, outcome=Outcome.LOST, loss=Loss.BRIGHT))[7:] == ["lost", "bright", ""]
 
     def test_loop_rows(self) -> None:
         keyframes = {k: KeyframeSummary(k, 0, k, k * 10**9, f"{k}.png") for k in (1, 8)}
@@ -87,7 +90,7 @@ class TestGoldenFormats:
     def test_columns(self, tmp_path: Path, make_record: MakeRecord) -> None:
         write_results(make_record(), tmp_path, load_config())
         assert (tmp_path / "frames.csv").read_text().splitlines()[:2] == [
-            "stamp,file,session,quality,inliers,reprojection_px,latency_ms,outcome",
+            "stamp,file,session,quality,inliers,reprojection_px,latency_ms,outcome,loss,near_share",
             "1700000000.000000001,rgb/000.png,0,marginal,100,0.5,10,new_session",
         ]
         assert (tmp_path / "loops.csv").read_text().splitlines()[0] == (
