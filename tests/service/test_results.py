@@ -91,7 +91,7 @@ class TestGoldenFormats:
         write_results(make_record(), tmp_path, load_config())
         assert (tmp_path / "frames.csv").read_text().splitlines()[:2] == [
             "stamp,file,session,quality,inliers,reprojection_px,latency_ms,outcome,loss,near_share",
-            "1700000000.000000001,rgb/000.png,0,marginal,100,0.5,10,new_session",
+            "1700000000.000000001,rgb/000.png,0,marginal,100,0.5,10,new_session,,",
         ]
         assert (tmp_path / "loops.csv").read_text().splitlines()[0] == (
             "query_stamp,match_stamp,query_file,match_file,accepted,reason,score,votes,jeffrey,inliers,tx,ty,tz,qx,qy,qz,qw"
