@@ -28,9 +28,9 @@ class Verdict(StrEnum):
 
 
 # Weights of 1, the verified score and ln(1 + inliers); found by benchmarks/calibrate_places.py, see docs/benchmarks.md.
-SINGLE: Final = (-6.911, 9.731, 1.138)
+SINGLE: Final = (-9.188, 14.04, 2.333)
 # Weights of 1 and the mean evidence along the best way, in standard deviations per image.
-ALONG_WAY: Final = (-6.269, 2.323)
+ALONG_WAY: Final = (-10.97, 5.461)
 
 
 def probability_single(score: float, inliers: int) -> float:

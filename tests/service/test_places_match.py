@@ -97,6 +97,7 @@ def test_views_from_elsewhere_find_their_place(folders: tuple[Path, Path], tmp_p
         assert best[f"q{number}"]["match"] == f"place {number}.png"
         assert 12 <= int(best[f"q{number}"]["inliers"]) <= 500
         assert best[f"q{number}"]["accepted"] == "1"
+    assert [best[f"q{number}"]["accepted"] for number in (1, 2, 3, 4)].count("1") >= 3
     for number in (5, 6, 7):
         assert best[f"q{number}"]["accepted"] == "0"
         assert int(best[f"q{number}"]["inliers"]) < 8
