@@ -128,7 +128,9 @@ def test_a_second_traversal_without_poses_is_judged_by_number(tmp_path: Path) ->
 
 def test_a_loop_is_judged_by_poses_and_the_recent_past_is_not_asked(tmp_path: Path) -> None:
     source = every_eighth(open_sources(["synth:small_loop"], mode="places"))
-    report = evaluate_places(source, None, EvalOptions(tmp_path, distance_m=2.0, angle_deg=60.0), CONFIG, 2, pytest.fail)
+    report = evaluate_places(
+        source, None, EvalOptions(tmp_path, distance_m=2.0, angle_deg=60.0), CONFIG, 2, pytest.fail
+    )
     assert report["queries"] == source.n_frames and report["against"] is None
     assert 0 < report["queries_with_a_true_place"] < source.n_frames / 2
     assert 0.6 <= report["recall_at"]["1"] <= report["recall_at"]["20"] <= 1
