@@ -15,8 +15,8 @@ $(STAMP): requirements.lock pyproject.toml docker/apt.sh
 	$(VENV)/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-# The kernels lie beside their room, where the editable installation finds them.
-$(NATIVE_STAMP): $(STAMP) CMakeLists.txt $(wildcard vocab/native/*)
+# The kernels lie beside their rooms, where the editable installation finds them.
+$(NATIVE_STAMP): $(STAMP) CMakeLists.txt $(wildcard vocab/native/* frontend/native/*)
 	cmake -S . -B build/native -G Ninja --log-level=WARNING -DPython_EXECUTABLE=$(abspath $(VENV))/bin/python
 	cmake --build build/native -- --quiet
 	cmake --install build/native --prefix src >/dev/null
@@ -50,4 +50,4 @@ messages: setup
 	$(VENV)/bin/python -m grpc_tools.protoc -I service --python_out=service --pyi_out=service service/messages.proto
 
 clean:
-	rm -rf $(VENV) build dist demo vocab/_native*.so .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist demo vocab/_native*.so frontend/_native*.so .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,66 @@
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Camera: TypeAlias = tuple[float, float, float, float]
+_Aligned: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+def align_along(
+    source: NDArray[np.uint8],
+    target: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    start: NDArray[np.float32],
+    directions: NDArray[np.float32],
+) -> _Aligned: ...
+def align_warped(
+    source: NDArray[np.uint8],
+    target: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    start: NDArray[np.float32],
+    unwarp: NDArray[np.float32],
+) -> _Aligned: ...
+def refine_pose(
+    T_odom_cam: NDArray[np.float64],
+    landmarks: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    inverse_depth: NDArray[np.float64],
+    inverse_sigma: NDArray[np.float64],
+    spread: NDArray[np.float64] | None,
+    origin: NDArray[np.float64] | None,
+    camera: _Camera,
+    pixel_sigma: float,
+    expected: NDArray[np.float64] | None,
+    sigma_m: float,
+    iterations: int,
+    converged: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None: ...
+def pixel_errors(
+    T_odom_cam: NDArray[np.float64],
+    landmarks: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    inverse_depth: NDArray[np.float64],
+    inverse_sigma: NDArray[np.float64],
+    spread: NDArray[np.float64] | None,
+    origin: NDArray[np.float64] | None,
+    camera: _Camera,
+    pixel_sigma: float,
+    nearest_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]: ...
+def adjust(
+    poses: NDArray[np.float64],
+    n_fixed: int,
+    landmarks: NDArray[np.float64],
+    keyframe_of: NDArray[np.int64],
+    landmark_of: NDArray[np.int64],
+    pixels: NDArray[np.float64],
+    inverse_depth: NDArray[np.float64],
+    inverse_sigma: NDArray[np.float64],
+    camera: _Camera,
+    pixel_sigma: float,
+    offset: float,
+    offset_information: float,
+    iterations: int,
+    damping: float,
+    least_decrease: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float]: ...

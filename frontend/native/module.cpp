@@ -1,0 +1,191 @@
+// What Python sees: seamark.frontend._native. Arrays are checked here for type and shape; nothing here holds the
+// interpreter while it computes.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <optional>
+#include <stdexcept>
+#include <tuple>
+#include <vector>
+
+#include "patches.hpp"
+#include "pose.hpp"
+#include "window.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace seamark {
+namespace {
+
+template <class T, long... Shape>
+using In = nb::ndarray<const T, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
+template <class T, long... Shape>
+using Out = nb::ndarray<nb::numpy, T, nb::shape<Shape...>>;
+using Grey = In<uint8_t, -1, -1>;
+using Pixels = In<float, -1, 2>;
+
+void require(bool condition, const char* what) {
+    if (!condition) throw std::invalid_argument(what);
+}
+
+template <class T, long... Shape>
+Out<T, Shape...> give(std::vector<T> values, std::initializer_list<size_t> shape) {
+    auto* kept = new std::vector<T>(std::move(values));
+    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+    return Out<T, Shape...>(kept->data(), shape, owner);
+}
+
+Image image_of(const Grey& grey) {
+    require(grey.shape(0) > 0 && grey.shape(1) > 0, "an image needs pixels");
+    return {grey.data(), static_cast<int>(grey.shape(1)), static_cast<int>(grey.shape(0))};
+}
+
+using Aligned = std::tuple<Out<float, -1, 2>, Out<float, -1>>;
+
+template <class Align, class Hints>
+Aligned aligned(Align align, const Grey& source, const Grey& target, const Pixels& points, const Pixels& start,
+                const Hints& hints) {
+    const size_t n = points.shape(0);
+    require(start.shape(0) == n && hints.shape(0) == n, "each point needs a start and a direction or warp");
+    const Image from = image_of(source), to = image_of(target);
+    std::vector<float> there(start.data(), start.data() + 2 * n), correlations(n);
+    {
+        nb::gil_scoped_release free;
+        align(from, to, points.data(), hints.data(), static_cast<int64_t>(n), there.data(), correlations.data());
+    }
+    return {give<float, -1, 2>(std::move(there), {n, 2}), give<float, -1>(std::move(correlations), {n})};
+}
+
+using Vector = In<double, -1>;
+using Points = In<double, -1, 3>;
+using Pose = In<double, 4, 4>;
+using Four = std::tuple<double, double, double, double>;
+
+Lens lens_of(const Four& camera, double pixel_sigma) {
+    return {std::get<0>(camera), std::get<1>(camera), std::get<2>(camera), std::get<3>(camera), pixel_sigma};
+}
+
+Seen seen_of(const In<double, -1, 2>& pixels, const Vector& inverse_depth, const Vector& inverse_sigma, size_t n) {
+    require(pixels.shape(0) == n && inverse_depth.shape(0) == n && inverse_sigma.shape(0) == n,
+            "each observation needs a pixel, an inverse depth and its sigma");
+    return {static_cast<int64_t>(n), pixels.data(), inverse_depth.data(), inverse_sigma.data()};
+}
+
+Landmarks landmarks_of(const Points& positions, const std::optional<Vector>& spread,
+                       const std::optional<In<double, 3>>& origin) {
+    require(!spread || (origin && spread->shape(0) == positions.shape(0)), "a spread is that of a distance from an origin");
+    return {positions.data(), spread ? spread->data() : nullptr, spread ? origin->data() : nullptr};
+}
+
+std::optional<std::tuple<Out<double, 4, 4>, Out<double, 6, 6>, Out<double, -1>>> refined(
+    const Pose& T, const Points& positions, const In<double, -1, 2>& pixels, const Vector& inverse_depth,
+    const Vector& inverse_sigma, const std::optional<Vector>& spread, const std::optional<In<double, 3>>& origin,
+    const Four& camera, double pixel_sigma, const std::optional<In<double, 3>>& expected, double sigma_m,
+    int iterations, double converged) {
+    const size_t n = positions.shape(0);
+    const Seen seen = seen_of(pixels, inverse_depth, inverse_sigma, n);
+    const Landmarks landmarks = landmarks_of(positions, spread, origin);
+    const Expected prior = {expected ? expected->data() : nullptr, sigma_m};
+    std::vector<double> pose(T.data(), T.data() + 16), H(36), errors(n);
+    bool determined = false;
+    {
+        nb::gil_scoped_release free;
+        determined = refine_pose(pose.data(), landmarks, seen, lens_of(camera, pixel_sigma), prior, iterations,
+                                 converged, H.data(), errors.data());
+    }
+    if (!determined) return std::nullopt;
+    return std::make_tuple(give<double, 4, 4>(std::move(pose), {4, 4}), give<double, 6, 6>(std::move(H), {6, 6}),
+                           give<double, -1>(std::move(errors), {n}));
+}
+
+std::tuple<Out<double, -1>, nb::ndarray<nb::numpy, bool, nb::shape<-1>>> errors_of(
+    const Pose& T, const Points& positions, const In<double, -1, 2>& pixels, const Vector& inverse_depth,
+    const Vector& inverse_sigma, const std::optional<Vector>& spread, const std::optional<In<double, 3>>& origin,
+    const Four& camera, double pixel_sigma, double nearest_m) {
+    const size_t n = positions.shape(0);
+    const Seen seen = seen_of(pixels, inverse_depth, inverse_sigma, n);
+    const Landmarks landmarks = landmarks_of(positions, spread, origin);
+    std::vector<double> errors(n);
+    auto* in_front = new bool[n];
+    nb::capsule owner(in_front, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
+    {
+        nb::gil_scoped_release free;
+        pixel_errors(T.data(), landmarks, seen, lens_of(camera, pixel_sigma), nearest_m, errors.data(), in_front);
+    }
+    return {give<double, -1>(std::move(errors), {n}),
+            nb::ndarray<nb::numpy, bool, nb::shape<-1>>(in_front, {n}, owner)};
+}
+
+void check(const Bundle& bundle, const In<int64_t, -1>& keyframe_of, const In<int64_t, -1>& landmark_of) {
+    const size_t n = bundle.seen.n;
+    require(keyframe_of.shape(0) == n && landmark_of.shape(0) == n, "each observation needs a keyframe and a landmark");
+    require(bundle.n_fixed >= 0 && bundle.n_fixed <= bundle.n_poses, "n_fixed is a number of poses");
+    for (size_t i = 0; i < n; ++i) {
+        const int64_t k = bundle.keyframe_of[i], l = bundle.landmark_of[i];
+        require(k >= 0 && k < bundle.n_poses, "keyframe_of names poses");
+        require(l >= 0 && l < bundle.n_landmarks && (i == 0 || l >= bundle.landmark_of[i - 1]),
+                "landmark_of names landmarks in ascending order");
+    }
+}
+
+std::tuple<Out<double, -1, 4, 4>, Out<double, -1, 3>, Out<double, -1>, Out<double, -1, 3, 3>, double, double> adjusted(
+    const In<double, -1, 4, 4>& poses, int64_t n_fixed, const Points& landmarks, const In<int64_t, -1>& keyframe_of,
+    const In<int64_t, -1>& landmark_of, const In<double, -1, 2>& pixels, const Vector& inverse_depth,
+    const Vector& inverse_sigma, const Four& camera, double pixel_sigma, double offset, double offset_information,
+    int iterations, double damping, double least_decrease) {
+    const size_t n_poses = poses.shape(0), n_landmarks = landmarks.shape(0), n = pixels.shape(0);
+    const Bundle bundle = {static_cast<int64_t>(n_poses),
+                           n_fixed,
+                           static_cast<int64_t>(n_landmarks),
+                           keyframe_of.data(),
+                           landmark_of.data(),
+                           seen_of(pixels, inverse_depth, inverse_sigma, n),
+                           lens_of(camera, pixel_sigma),
+                           offset,
+                           offset_information};
+    check(bundle, keyframe_of, landmark_of);
+    Adjusted state;
+    state.poses.assign(poses.data(), poses.data() + 16 * n_poses);
+    state.landmarks.assign(landmarks.data(), landmarks.data() + 3 * n_landmarks);
+    state.offset = offset;
+    {
+        nb::gil_scoped_release free;
+        adjust(bundle, iterations, damping, least_decrease, state);
+    }
+    return {give<double, -1, 4, 4>(std::move(state.poses), {n_poses, 4, 4}),
+            give<double, -1, 3>(std::move(state.landmarks), {n_landmarks, 3}),
+            give<double, -1>(std::move(state.errors), {n}),
+            give<double, -1, 3, 3>(std::move(state.covariances), {n_landmarks, 3, 3}),
+            state.offset,
+            state.depth_information};
+}
+
+}  // namespace
+
+NB_MODULE(_native, m) {
+    m.doc() = "Kernels of the front end; seamark.frontend.patches, pose and window are their users' side.";
+    m.def(
+        "align_along",
+        [](const Grey& source, const Grey& target, const Pixels& points, const Pixels& start, const Pixels& along) {
+            return aligned(align_along, source, target, points, start, along);
+        },
+        "source"_a, "target"_a, "points"_a, "start"_a, "directions"_a);
+    m.def(
+        "align_warped",
+        [](const Grey& source, const Grey& target, const Pixels& points, const Pixels& start,
+           const In<float, -1, 2, 2>& unwarp) { return aligned(align_warped, source, target, points, start, unwarp); },
+        "source"_a, "target"_a, "points"_a, "start"_a, "unwarp"_a);
+    m.def("refine_pose", &refined, "T_odom_cam"_a, "landmarks"_a, "pixels"_a, "inverse_depth"_a, "inverse_sigma"_a,
+          "spread"_a.none(), "origin"_a.none(), "camera"_a, "pixel_sigma"_a, "expected"_a.none(), "sigma_m"_a,
+          "iterations"_a, "converged"_a);
+    m.def("pixel_errors", &errors_of, "T_odom_cam"_a, "landmarks"_a, "pixels"_a, "inverse_depth"_a, "inverse_sigma"_a,
+          "spread"_a.none(), "origin"_a.none(), "camera"_a, "pixel_sigma"_a, "nearest_m"_a);
+    m.def("adjust", &adjusted, "poses"_a, "n_fixed"_a, "landmarks"_a, "keyframe_of"_a, "landmark_of"_a, "pixels"_a,
+          "inverse_depth"_a, "inverse_sigma"_a, "camera"_a, "pixel_sigma"_a, "offset"_a, "offset_information"_a,
+          "iterations"_a, "damping"_a, "least_decrease"_a);
+}
+
+}  // namespace seamark
