@@ -1,6 +1,7 @@
 """The camera's pose from landmarks: P3P-RANSAC, then robust Gauss-Newton on pixels and inverse depths."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -8,18 +9,14 @@ from numpy.typing import NDArray
 
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
-from seamark.frontend.residuals import (
-    Observations,
-    discount,
-    pose_jacobian,
-    residuals_and_jacobian,
-    retract,
-    robust_weights,
-    shift_of_distance,
-)
+from seamark.frontend.kernels import native
+from seamark.frontend.residuals import Observations, residuals_and_jacobian, shift_of_distance
 
 ITERATIONS = 8
 CONVERGED = 1e-7
+NEAREST_M = 1e-3
+
+Array: TypeAlias = NDArray[np.float64]
 
 # Shared errors of landmarks over one keyframe step: see motion_covariance.
 ROTATION_FLOOR = 5e-4
@@ -167,14 +164,10 @@ def whitened_errors(
 
     What an uncertain distance explains of an error is taken off.
     """
-    in_cam = se3.transform(se3.inverse(T_odom_cam), observations.landmarks)
-    in_front = in_cam[:, 2] > 1e-3
-    safe = np.where(in_front[:, None], in_cam, [0, 0, 1])
-    residuals, J_point = residuals_and_jacobian(safe, observations, camera, pixel_sigma)
-    pixels = residuals[:, :2].copy()
-    if observations.spread is not None:
-        discount(shift_of_distance(T_odom_cam, safe, observations, J_point), pixels)
-    return np.linalg.norm(pixels, axis=1) * pixel_sigma, in_front
+    errors, in_front = native.pixel_errors(
+        np.ascontiguousarray(T_odom_cam), *_arrays(observations), _intrinsics(camera), pixel_sigma, NEAREST_M
+    )
+    return errors * pixel_sigma, in_front
 
 
 def refine_pose(
@@ -189,30 +182,42 @@ def refine_pose(
 
     Raises numpy.linalg.LinAlgError when the landmarks do not determine the pose.
     """
-    T = T_odom_cam
-    H: NDArray[np.float64] = np.eye(6)
-    for _ in range(ITERATIONS):
-        in_cam = se3.transform(se3.inverse(T), observations.landmarks)
-        in_cam[:, 2] = np.maximum(in_cam[:, 2], 1e-3)
-        residuals, J_point = residuals_and_jacobian(in_cam, observations, camera, pixel_sigma)
-        if observations.spread is not None:
-            shift = shift_of_distance(T, in_cam, observations, J_point)
-            discount(shift, residuals[:, :2], J_point[:, :2])
-        J = J_point @ pose_jacobian(in_cam)
-        weights = robust_weights(residuals)
-        Jw = (J * weights[:, :, None]).reshape(-1, 6)
-        H = np.asarray(Jw.T @ J.reshape(-1, 6) + 1e-9 * np.eye(6), np.float64)
-        gradient = Jw.T @ residuals.reshape(-1)
-        if prediction is not None:
-            R_cam_odom, off = T[:3, :3].T, T[:3, 3] - prediction.T_odom_cam[:3, 3]
-            gradient[3:] += R_cam_odom @ off / prediction.sigma_m**2
-            H[np.arange(3, 6), np.arange(3, 6)] += 1 / prediction.sigma_m**2
-        delta = np.asarray(-np.linalg.solve(H, gradient), np.float64)
-        T = retract(T, delta)
-        if float(delta @ delta) < CONVERGED**2:
-            break
-    spread = float(np.median(np.linalg.norm(residuals[:, :2], axis=1))) / 1.1774  # sigma of a Rayleigh median
+    expected = None if prediction is None else np.ascontiguousarray(prediction.T_odom_cam[:3, 3])
+    refined = native.refine_pose(
+        np.ascontiguousarray(T_odom_cam),
+        *_arrays(observations),
+        _intrinsics(camera),
+        pixel_sigma,
+        expected,
+        1.0 if prediction is None else prediction.sigma_m,
+        ITERATIONS,
+        CONVERGED,
+    )
+    if refined is None:
+        raise np.linalg.LinAlgError("the landmarks do not determine the pose")
+    T, H, errors = refined
+    spread = float(np.median(errors)) / 1.1774  # sigma of a Rayleigh median
     return se3.orthonormalise(T), np.asarray(np.linalg.inv(H) * max(1.0, spread) ** 2, np.float64)
+
+
+_Arrays: TypeAlias = tuple[Array, Array, Array, Array, Array | None, Array | None]
+
+
+def _arrays(observations: Observations) -> _Arrays:
+    """Return landmarks, pixels, inverse depths, their sigmas, spread and origin as the kernels take them."""
+    o = observations
+    return (
+        np.ascontiguousarray(o.landmarks),
+        np.ascontiguousarray(o.pixels),
+        np.ascontiguousarray(o.inverse_depth),
+        np.ascontiguousarray(o.inverse_sigma),
+        None if o.spread is None else np.ascontiguousarray(o.spread),
+        None if o.origin is None else np.ascontiguousarray(o.origin),
+    )
+
+
+def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def motion_covariance(
