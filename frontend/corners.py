@@ -1,4 +1,8 @@
-"""Corners spread over the image: Harris or Shi-Tomasi response, the best of every free grid cell, sub-pixel refined."""
+"""Corners spread over the image: Harris or Shi-Tomasi response, the best of every free grid cell, sub-pixel refined.
+
+Two floors hold noise off: a share of the image's own strong corners, and a least response. In images of low contrast,
+where the second would leave nothing, it sinks to what their noise can reach.
+"""
 
 import cv2
 import numpy as np
@@ -8,6 +12,9 @@ HARRIS_K = 0.04
 BLOCK_PX = 5
 BORDER_PX = 8
 RELATIVE_RESPONSE = 0.002  # of the image's strongest corners: keeps dark and low-texture images populated
+NOISE_RESPONSE = 3.0  # noise alone reaches 2.1 times its variance in an image
+LEAST_RESPONSE = 2e-6  # what rounding to whole grey levels can hide
+_NOISE_FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # blind to edges and ramps
 SUBPIXEL = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 0.02)
 
 
@@ -22,6 +29,16 @@ def corner_response(grey: NDArray[np.uint8], *, harris: bool) -> NDArray[np.floa
     return cv2.cornerMinEigenVal(image, BLOCK_PX, ksize=3)
 
 
+def least_response(grey: NDArray[np.uint8], min_response: float) -> float:
+    """Return what a Shi-Tomasi response must exceed: ``min_response``, or less where the noise of the image is low.
+
+    The noise is estimated after Immerkaer (1996), by the median, which texture hardly moves.
+    """
+    filtered = cv2.filter2D(grey, cv2.CV_32F, _NOISE_FILTER)[::3, ::3]
+    sigma = float(np.median(np.abs(filtered))) / (6 * 0.6745 * 255)
+    return min(min_response, max(LEAST_RESPONSE, NOISE_RESPONSE * sigma**2))
+
+
 def detect_corners(
     grey: NDArray[np.uint8],
     occupied: NDArray[np.floating],
@@ -29,12 +46,13 @@ def detect_corners(
     *,
     harris: bool,
     min_response: float,
+    mask: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float32]:
     """Find new corners (M, 2) float32 in the grid cells that no point of ``occupied`` (N, 2) lies in.
 
     The grid has about ``n_corners`` cells; M + N stays near ``n_corners`` at most. A cell's corner must exceed
-    ``min_response`` (for Harris its square, the response being a product of two eigenvalues) and a small share of the
-    image's strong corners.
+    ``min_response`` (for Harris its square, the response being a product of two eigenvalues), or less in an image of
+    low contrast, and a small share of the image's strong corners. None is taken where ``mask`` (H, W) is zero.
     """
     height, width = grey.shape
     cell = max(8, round(float(np.sqrt(width * height / n_corners))))
@@ -44,13 +62,18 @@ def detect_corners(
     response = corner_response(grey, harris=harris)
     response[:BORDER_PX] = response[-BORDER_PX:] = 0
     response[:, :BORDER_PX] = response[:, -BORDER_PX:] = 0
+    if mask is not None:
+        response[mask == 0] = 0
 
     cells = response[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).swapaxes(1, 2)
     flat = cells.reshape(rows * columns, cell * cell)
     best = flat.argmax(axis=1)
     strength = flat[np.arange(len(flat)), best]
-    floor = max(min_response**2 if harris else min_response, RELATIVE_RESPONSE * float(np.quantile(strength, 0.95)))
-    wanted = strength > floor
+    relative = RELATIVE_RESPONSE * float(np.quantile(strength, 0.95))
+    if relative < (min_response**2 if harris else min_response):
+        least = least_response(grey, min_response)
+        relative = max(relative, least**2 if harris else least)
+    wanted = strength > relative
 
     if len(occupied):
         grid = np.floor(np.asarray(occupied) / cell).astype(int)

@@ -22,10 +22,15 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(descriptors / total)), 255).astype(np.uint8)
 
 
-def extract_features(image: NDArray[np.uint8], n_features: int, contrast: float = 0.015) -> Features:
-    """Find at most ``n_features`` SIFT key points (Lowe 2004) in a grey or BGR uint8 image, strongest first."""
+def extract_features(
+    image: NDArray[np.uint8], n_features: int, contrast: float = 0.015, mask: NDArray[np.uint8] | None = None
+) -> Features:
+    """Find at most ``n_features`` SIFT key points (Lowe 2004) in a grey or BGR uint8 image, strongest first.
+
+    None is taken where ``mask`` (H, W) uint8 is zero.
+    """
     sift = cv2.SIFT_create(nfeatures=n_features, contrastThreshold=contrast, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey_of(image), None)
+    keypoints, descriptors = sift.detectAndCompute(grey_of(image), mask)
     if descriptors is None or len(keypoints) == 0:
         return Features.empty()
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float32)
