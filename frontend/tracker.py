@@ -9,6 +9,7 @@ from seamark.frontend.depth import DepthImage, DepthSensor
 from seamark.frontend.patches import align_warped
 from seamark.frontend.pose import PoseEstimate, estimate_pose
 from seamark.frontend.session import Session
+from seamark.frontend.tone import match_tone
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import rotation_compensated_parallax
 from seamark.frontend.types import Frame
@@ -45,15 +46,18 @@ def follow(
 ) -> tuple[Tracks, NDArray[np.float32]]:
     """Follow the live tracks into the next grey image; returns the survivors and where they were (N, 2).
 
-    A prediction that loses half of the tracks was wrong: the image is then searched from where they were.
+    Where half of the tracks are lost, the prediction was wrong, or the exposure has changed: they are then searched
+    from where they were, and in the tone of the new image.
     """
     c, tracks = session.config, session.tracks
     if len(tracks) == 0:
         return tracks, tracks.pixels
 
-    def attempt(guess: NDArray[np.float32] | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def attempt(
+        image: NDArray[np.uint8], guess: NDArray[np.float32] | None
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         return flow.track(
-            before,
+            image,
             after,
             tracks.pixels,
             guess,
@@ -62,11 +66,15 @@ def follow(
             round_trip_px=c.flow_round_trip_px,
         )
 
-    there, ok = attempt(predict_pixels(session, tracks) if predict else None)
-    if predict and ok.mean() < RETRY_SURVIVORS:
-        again, ok_again = attempt(None)
-        if ok_again.sum() > ok.sum():
-            there, ok = again, ok_again
+    guess = predict_pixels(session, tracks) if predict else None
+    there, ok = attempt(before, guess)
+    if ok.mean() < RETRY_SURVIVORS:
+        toned = match_tone(before, after)
+        others = [(before, None)] if predict else []
+        others += [(toned, guess)] if toned is not before else []
+        for again, ok_again in (attempt(*other) for other in others):
+            if ok_again.sum() > ok.sum():
+                there, ok = again, ok_again
     return Tracks(tracks.ids[ok], there[ok]), tracks.pixels[ok]
 
 

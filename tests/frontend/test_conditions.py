@@ -12,6 +12,7 @@ from seamark.frontend import se3
 from seamark.frontend.admission import StampGate
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.odometry import Frontend
+from seamark.frontend.tone import match_tone, tone_curve
 from seamark.frontend.types import Frame, Loss, Mode, Odometry, Outcome, Quality
 
 CONFIG = FrontendConfig(max_corners=250, sift_features=300)
@@ -224,3 +225,45 @@ def test_a_partly_covered_lens_does_not_hold_the_camera(cover: str) -> None:
     assert set(outcomes(odometry[1:])) <= POSED
     assert {one.session for one in odometry} == {0}
     assert 0 < worst_error(odometry, truth) < 0.05
+
+
+# Light
+
+
+def exposed(frame: Frame, gain: float, gamma: float = 1.0, bias: float = 0.0) -> Frame:
+    light = np.clip(gain * frame.image.astype(float) / 255, 0, 1) ** gamma
+    return replace(frame, image=np.clip(np.rint(255 * light + bias), 0, 255).astype(np.uint8))
+
+
+LIGHT: list[tuple[str, Callable[[int, Frame], Frame]]] = [
+    ("step down", lambda i, frame: exposed(frame, 0.4 if i >= 8 else 1)),
+    ("step up", lambda i, frame: exposed(frame, 1.6 if i >= 8 else 1)),
+    ("flicker", lambda i, frame: exposed(frame, (0.3, 1.0)[i % 2])),
+    ("gamma", lambda i, frame: exposed(frame, 1, (1, 2.0, 0.5)[i // 4 % 3])),
+    ("bias", lambda i, frame: exposed(frame, 0.8, bias=(0, 50)[i // 6 % 2])),
+]
+
+
+@pytest.mark.parametrize(("name", "light"), LIGHT, ids=[name for name, _ in LIGHT])
+def test_changes_of_exposure_are_tracked_by_flow(name: str, light: Callable[[int, Frame], Frame]) -> None:
+    """Test: exposure, gain or gamma change in steps or at every frame. Expected: tracked, never by descriptors."""
+    frames, truth = walk(16)
+    odometry = track([light(i, frame) for i, frame in enumerate(frames)])
+    assert set(outcomes(odometry[1:])) == {Outcome.TRACKED}
+    assert 0 < worst_error(odometry, truth) < 0.05
+    assert sum(one.keyframe_id is not None for one in odometry) < 8
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 2.2])
+def test_the_tone_curve_is_the_change_that_was_made(gamma: float) -> None:
+    """Expected: the curve between two exposures of one view within 2 grey levels; none between equal ones."""
+    image = cv2.cvtColor(WORLD.view(toy_sequence("loop", 160, world=WORLD).ground_truth.T_world_cam[0])[0], 6)
+    levels = np.arange(256)
+    expected = np.rint(255 * (0.7 * levels / 255) ** gamma).astype(np.uint8)
+    curve = tone_curve(image, cv2.LUT(image, expected))
+    assert curve is not None
+    present = np.bincount(image[::4].ravel(), minlength=256) > 20
+    assert present.sum() > 80
+    assert np.abs(curve.astype(int) - expected)[present].max() <= 2
+    assert tone_curve(image, image) is None
+    assert match_tone(image, image) is image
