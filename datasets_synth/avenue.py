@@ -126,16 +126,22 @@ def stock(rng: np.random.Generator, leaves: np.random.Generator) -> Stock:
 def strips(points: NDArray[np.float64], widths: tuple[float, float], z: float, images: list[Image]) -> list[Panel]:
     """Return a band along the polyline (N, 2), from ``widths[0]`` to ``widths[1]`` m left of it, pictures in turn."""
     panels = []
+    lap = _overlap(points, max(abs(width) for width in widths)) if len(points) > 2 else 0.0
     for number, (a, b) in enumerate(pairwise(points)):
         length = float(np.linalg.norm(b - a))
         along = (b - a) / length
         left = np.array([-along[1], along[0]])
-        lap = 0.02 * (widths[1] - widths[0]) if len(points) > 2 else 0.0  # neighbours overlap where the road bends
         corner = np.array([*(a - lap * along + widths[1] * left), z + 0.004 * (number % 2)])
         right = np.array([*((length + 2 * lap) * along), 0.0])
         down = np.array([*((widths[0] - widths[1]) * left), 0.0])
         panels.append(Panel(corner, right, down, images[number % len(images)], tiles=(length / STRIP_M, 1.0)))
     return panels
+
+
+def _overlap(points: NDArray[np.float64], most_aside: float) -> float:
+    """Return by how many m neighbours must overlap so that no gap is left outside the sharpest bend."""
+    headings = np.unwrap(np.arctan2(*np.diff(points, axis=0).T[::-1]))
+    return float(most_aside * np.tan(np.abs(np.diff(headings)).max() / 2) + 0.02)
 
 
 def house(

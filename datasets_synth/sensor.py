@@ -18,8 +18,9 @@ from seamark.datasets_synth.textures import Image
 from seamark.frontend.types import Frame
 
 DEPTH_FACTOR = 5000.0  # raw units per metre, as in the TUM RGB-D sets
-DEPTH_STEP_M = 0.001  # cheap depth cameras give whole millimetres
-DEPTH_RANGE_M = (0.3, 8.0)
+EDGE_JUMP = 0.1  # a window that spans two depths which differ by that share of the nearer one gives none
+SHADOW_TOLERANCE_PX = 0.5
+NOTHING_M = 1e6
 DEPTH_NOISE_CELL_PX = 4
 DISTORTION_CELLS = (4, 5)
 DISTORTION_AT_M = 4.0
@@ -33,12 +34,17 @@ class SensorModel:
 
     ``image_noise_grey`` is a standard deviation; ``depth_noise_per_m`` times z squared is that of depth: 0.001 is 1 mm
     at 1 m and 16 mm at 4 m. ``depth_distortion`` is the standard deviation over the image of the relative error of
-    depth at 4 m, the same in all frames and proportional to depth, with a mean of zero.
+    depth at 4 m, the same in all frames and proportional to depth, with a mean of zero. ``depth_step_m`` is what depth
+    is rounded to. ``projector_m`` is how far right of the camera the pattern comes from that depth is measured by:
+    there are holes to the left of near things, where it does not reach, and along all edges; with 0 there are none.
     """
 
     image_noise_grey: float
     depth_noise_per_m: float
     depth_distortion: float
+    projector_m: float = 0.05
+    depth_step_m: float = 0.001
+    depth_range_m: tuple[float, float] = (0.3, 8.0)
 
     def distortion_field(self, height: int, width: int, seed: int) -> NDArray[np.float32]:
         """Return the relative error of depth (H, W) at DISTORTION_AT_M of one camera."""
@@ -48,7 +54,11 @@ class SensorModel:
         return field
 
 
-MODELS = {"mild": SensorModel(2.0, 0.001, 0.0), "cheap": SensorModel(5.0, 0.003, 0.03)}
+MODELS = {
+    "ideal": SensorModel(0.0, 0.0, 0.0, 0.0, 1 / DEPTH_FACTOR, (0.0, np.iinfo(np.uint16).max / DEPTH_FACTOR)),
+    "mild": SensorModel(2.0, 0.001, 0.0),
+    "cheap": SensorModel(5.0, 0.003, 0.03, projector_m=0.075),
+}
 
 
 @dataclass(frozen=True)
@@ -87,22 +97,46 @@ def expose(colour: NDArray[np.float32], model: SensorModel, rng: np.random.Gener
 
 
 def measure_depth(
-    depth: NDArray[np.float32], distortion: NDArray[np.float32], model: SensorModel, rng: np.random.Generator
+    depth: NDArray[np.float32],
+    distortion: NDArray[np.float32],
+    model: SensorModel,
+    rng: np.random.Generator,
+    focal_px: float,
 ) -> NDArray[np.uint16]:
-    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: distorted, noise growing with z squared, whole mm, 0 out of range.
+    """Return raw depth (H, W) in 1 / DEPTH_FACTOR m: distorted, noise growing with z squared, in steps, with holes.
 
-    The noise is alike over DEPTH_NOISE_CELL_PX pixels, because such cameras match windows and not single pixels.
+    0 is a hole: out of range, at an edge, or in the shadow of something nearer. The noise is alike over
+    DEPTH_NOISE_CELL_PX pixels, because such cameras match windows and not single pixels.
     """
     height, width = depth.shape
     cells = rng.standard_normal((height // DEPTH_NOISE_CELL_PX + 1, width // DEPTH_NOISE_CELL_PX + 1), np.float32)
     smooth = cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR)
     per_square = distortion / np.float32(DISTORTION_AT_M) + np.float32(1.5 * model.depth_noise_per_m) * smooth
     noisy = depth + depth**2 * per_square  # 1.5, because linear interpolation leaves 1 / 1.5 of the noise
-    steps = np.rint(noisy / np.float32(DEPTH_STEP_M))
-    near, far = DEPTH_RANGE_M
-    raw = np.where((depth >= near) & (noisy >= near) & (noisy <= far), steps * (DEPTH_STEP_M * DEPTH_FACTOR), 0)
+    steps = np.rint(noisy / np.float32(model.depth_step_m))
+    near, far = model.depth_range_m
+    seen = (depth >= near) & (noisy >= near) & (noisy <= far)
+    if model.projector_m > 0:
+        seen &= ~holes(depth, model.projector_m * focal_px)
+    raw = np.where(seen, steps * (model.depth_step_m * DEPTH_FACTOR), 0)
     measured: NDArray[np.uint16] = np.rint(raw).astype(np.uint16)
     return measured
+
+
+def holes(depth: NDArray[np.float32], projector_px_m: float) -> NDArray[np.bool_]:
+    """Return where (H, W) the pattern of a projector to the right does not reach or windows span an edge.
+
+    ``projector_px_m`` is its distance from the camera times the focal length. The pattern meets the surface of a pixel
+    where no pixel farther right meets the same or an earlier column of it.
+    """
+    depth = np.where(depth > 0, depth, np.float32(NOTHING_M))
+    window = np.ones((3, 3), np.uint8)
+    nearest = cv2.erode(depth, window)
+    edges = cv2.dilate(depth, window) > (1 + EDGE_JUMP) * nearest
+    columns = np.arange(depth.shape[1], dtype=np.float32) - np.float32(projector_px_m) / depth
+    first = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
+    found: NDArray[np.bool_] = edges | (columns > first + SHADOW_TOLERANCE_PX)
+    return found
 
 
 def code_picture(image: Image) -> bytes:

@@ -52,7 +52,7 @@ class Studio:
         depth_file = b""
         if wanted.mode is Mode.RGBD:
             depth = self._lens.depth(view.depth)
-            depth_file = sensor.code_depth(sensor.measure_depth(depth, self._warp, model, rng))
+            depth_file = sensor.code_depth(sensor.measure_depth(depth, self._warp, model, rng, wanted.rig.cam0.fx))
         labels_file = b""
         if wanted.labels and view.labels is not None:
             seen = self._lens.labels(view.labels)

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from seamark import SeamarkError
 from seamark.datasets_synth.fallback import small_loop_path
 from seamark.datasets_synth.scenario import open_synth
 from seamark.datasets_synth.sequence import SynthSequence
@@ -61,3 +62,8 @@ def reprojection_errors(sequence: SynthSequence, a: Frame, b: Frame) -> np.ndarr
     known = depth > 0
     points = se3.transform(T_b_a, (sequence.rig.cam0.rays(seen_a) * depth[:, None])[known])
     return sequence.rig.cam0.project(points) - seen_b[known]
+
+
+def test_it_takes_no_settings() -> None:
+    with pytest.raises(SeamarkError, match="takes no settings"):
+        open_synth("small_loop,frames=20")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from seamark import SeamarkError
-from seamark.datasets_synth import clutter, figures, movers, specification, world_office, world_twins
+from seamark.datasets_synth import clutter, figures, movers, specification, world_office, world_road, world_twins
 from seamark.datasets_synth.panels import Panel
 from seamark.datasets_synth.world import World
 from seamark.datasets_synth.worlds import WORLDS
@@ -54,6 +54,22 @@ def test_panels_are_rectangles_and_few(name: str, worlds: dict[str, World]) -> N
     for panel in panels:
         assert abs(panel.right @ panel.down) < 1e-6 * np.linalg.norm(panel.right) * np.linalg.norm(panel.down)
         assert panel.image.dtype == np.uint8 and panel.image.flags.c_contiguous
+
+
+def test_a_bending_road_has_no_gaps(worlds: dict[str, World]) -> None:
+    strips = [p for p in worlds["road"].panels if 0 <= p.corner[2] < 0.01 and abs(p.right[2]) + abs(p.down[2]) < 1e-9]
+    bends = world_road.middle()[1:-1]
+    assert len(strips) > len(bends)
+    rng = np.random.default_rng(0)
+    around = np.concatenate([bends + rng.uniform(-1, 1, bends.shape) * world_road.ROAD_M / 2 for _ in range(300)])
+    onto = np.linalg.norm(around[:, None] - bends[None], axis=2).min(axis=1) < world_road.ROAD_M / 2 - 0.05
+    points = np.column_stack([around[onto], np.zeros(int(onto.sum()))])
+    covered = np.zeros(len(points), bool)
+    for strip in strips:
+        along = [(points - strip.corner) @ edge / (edge @ edge) for edge in (strip.right, strip.down)]
+        covered |= np.all([(share >= 0) & (share <= 1) for share in along], axis=0)
+    assert len(points) > 1000
+    assert covered.all()
 
 
 def test_closed_routes_close_within_their_frames() -> None:

@@ -81,6 +81,7 @@ def test_refusals_are_sentences(tmp_path: Path) -> None:
         ("toy,frames=9,frames=8", "tum", tmp_path / "new", "given twice"),
         ("atlantis", "tum", tmp_path / "new", "no synthetic world 'atlantis'"),
         ("small_loop", "tum", tmp_path / "new", "small_loop is kept in layout tum at /"),
+        ("small_loop,sensors=rgbd", "tum", tmp_path / "new", "small_loop is kept in layout tum at /"),
         ("loop,size=small,trajectory=lawn_mower", "tum", tmp_path / "new", "needs an open area"),
     ):
         with pytest.raises(SeamarkError, match=message) as caught:
