@@ -11,7 +11,8 @@ def refusal(frame: Frame, rig: Rig | None, mode: Mode) -> Outcome | None:
     """Return why the pictures of a frame cannot be used, or None; pictures that the mode does not read do not matter.
 
     UNREADABLE: a picture of another type or number of channels than Frame allows, or without pixels. WRONG_SIZE: an
-    image contradicts the calibration (which mode places can do without), or depth has another size than its image.
+    image contradicts the calibration (which mode places can do without), or depth or
+    mask has another size than its image.
     """
     right = frame.image_right if mode is Mode.STEREO else None
     depth = frame.depth if mode is Mode.RGBD else None
@@ -19,7 +20,9 @@ def refusal(frame: Frame, rig: Rig | None, mode: Mode) -> Outcome | None:
         return Outcome.UNREADABLE
     if rig is not None and mode is not Mode.PLACES and frame.image.shape[:2] != (rig.cam0.height, rig.cam0.width):
         return Outcome.WRONG_SIZE
-    if any(other is not None and other.shape[:2] != frame.image.shape[:2] for other in (right, depth)):
+    if frame.mask is not None and (frame.mask.ndim != 2 or frame.mask.dtype != np.uint8):
+        return Outcome.UNREADABLE
+    if any(other is not None and other.shape[:2] != frame.image.shape[:2] for other in (right, depth, frame.mask)):
         return Outcome.WRONG_SIZE
     return None
 

@@ -55,7 +55,7 @@ def detect_corners(
     low contrast, and a small share of the image's strong corners. None is taken where ``mask`` (H, W) is zero.
     """
     height, width = grey.shape
-    cell = max(8, round(float(np.sqrt(width * height / n_corners))))
+    cell = cell_side(grey.shape, n_corners)
     rows, columns = height // cell, width // cell
     if rows == 0 or columns == 0:
         return np.zeros((0, 2), np.float32)
@@ -85,15 +85,24 @@ def detect_corners(
     y = chosen // columns * cell + best[chosen] // cell
     x = chosen % columns * cell + best[chosen] % cell
     points = np.column_stack([x, y]).astype(np.float32)
-    points = _away_from(points, strength[chosen], occupied, 0.5 * cell)
+    return refine(grey, away_from(points, strength[chosen], occupied, 0.5 * cell))
+
+
+def cell_side(shape: tuple[int, ...], n_corners: int) -> int:
+    """Return the side in pixels of the grid's cells, of which an image (H, W) has about ``n_corners``."""
+    return max(8, round(float(np.sqrt(shape[0] * shape[1] / n_corners))))
+
+
+def refine(grey: NDArray[np.uint8], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Move corners (N, 2) to where the gradients around them say, without those that run away."""
     if len(points) == 0:
-        return points
+        return np.zeros((0, 2), np.float32)
     refined = cv2.cornerSubPix(grey, points.reshape(-1, 1, 2).copy(), (4, 4), (-1, -1), SUBPIXEL).reshape(-1, 2)
     settled = np.linalg.norm(refined - points, axis=1) < 4
     return np.ascontiguousarray(refined[settled], np.float32)
 
 
-def _away_from(
+def away_from(
     points: NDArray[np.float32],
     strength: NDArray[np.float32],
     occupied: NDArray[np.floating],

@@ -29,3 +29,21 @@ class Tracks:
     def __add__(self, more: "Tracks") -> "Tracks":
         """Return these and then the others, whose ids must be different ones."""
         return Tracks(np.concatenate([self.ids, more.ids]), np.vstack([self.pixels, more.pixels]))
+
+
+class TrackAges:
+    """Counts for how many posed frames each track has lived."""
+
+    def __init__(self) -> None:
+        self._session = -1
+        self._ids = np.zeros(0, np.int64)
+        self._ages = np.zeros(0, np.int32)
+
+    def step(self, session: int, ids: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the ages (N,) of the tracks (N,) of the next posed frame; those not seen before are 1."""
+        ages = np.ones(len(ids), np.int32)
+        if session == self._session:
+            _, now, before = np.intersect1d(ids, self._ids, assume_unique=True, return_indices=True)
+            ages[now] += self._ages[before]
+        self._session, self._ids, self._ages = session, ids, ages
+        return ages
