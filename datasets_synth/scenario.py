@@ -42,10 +42,10 @@ def open_synth(spec: str, *, cache_dir: Path | None = None) -> SynthSequence:
     is first iterated, and kept under ``cache_dir``/synth once a pass is complete. Raises SeamarkError for unknown
     names, listing those that exist, and NoVulkanDevice where the sequence is not in the cache and nothing can render.
     """
-    kept, settings = scenarios.split(spec)
-    if kept == fallback.NAME:
-        if settings:
-            raise SeamarkError(f"{kept} is kept as it was rendered and takes no settings; synth:loop,size=small does")
+    kept, comma, _ = spec.partition(",")
+    if kept.strip() == fallback.NAME:
+        if comma:
+            raise SeamarkError(f"{fallback.NAME} is kept as it is and takes no settings; loop,size=small does")
         return fallback.open_small_loop()
     text = scenarios.expand(spec)
     if toy_names.is_toy(text):

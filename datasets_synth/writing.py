@@ -170,7 +170,7 @@ def _put(file: Path, content: bytes) -> None:
 
 def _plan(spec: str, cache_dir: Path | None) -> _Plan:
     text = scenarios.expand(spec)
-    if scenarios.split(text)[0] == fallback.NAME:
+    if text.split(",")[0].strip() == fallback.NAME:
         raise SeamarkError(f"{fallback.NAME} is kept in layout tum at {fallback.small_loop_path()}")
     return _plan_toy(toy_names.parse(text)) if toy_names.is_toy(text) else _plan_world(text, cache_dir)
 
