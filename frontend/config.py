@@ -1,5 +1,6 @@
 """Configuration of the front end; every default works for hand-held, driving and flying cameras alike."""
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -11,7 +12,11 @@ class FrontendConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     # Corners and their tracks
-    corner_detector: Literal["harris", "shi_tomasi"] = Field("shi_tomasi", description="corner response")
+    corner_detector: Literal["harris", "shi_tomasi", "harris_laplace"] = Field(
+        "shi_tomasi", description="corner response; harris_laplace takes corners of all scales, at ten times the cost"
+    )
+    mask_file: Path | None = Field(None, description="image of the camera's size, black where nothing is to be used")
+    motion_masks: bool = Field(True, description="say what moves while the camera stands still")
     max_corners: int = Field(420, ge=50, le=5000, description="tracked corners per image, spread by grid")
     min_corner_response: float = Field(2e-5, gt=0, description="floor of the Shi-Tomasi response (image in 0..1)")
     flow_window_px: int = Field(21, ge=5, le=51, description="side of the Lucas-Kanade patch")
@@ -43,6 +48,13 @@ class FrontendConfig(BaseModel):
     )
     keyframe_rotation_deg: float = Field(15.0, gt=0, description="rotation of a new keyframe against the last")
     keyframe_tracked_ratio: float = Field(0.6, gt=0, lt=1, description="share of the keyframe's landmarks still seen")
+    keyframe_shared_ratio: float = Field(
+        0.4,
+        ge=0,
+        lt=1,
+        description="share of the tracks of the map's last keyframe, still followed, above which "
+        "a keyframe of the window is not worth one of the map",
+    )
     window_keyframes: int = Field(8, ge=3, le=30, description="keyframes adjusted together")
     window_iterations: int = Field(6, ge=1, le=50, description="Levenberg-Marquardt steps at most")
 

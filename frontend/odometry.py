@@ -16,11 +16,13 @@ from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import grey_of
 from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.loss import MIN_CORNERS, loss_of
+from seamark.frontend.masks import allowed, combined, read_mask
 from seamark.frontend.monocular import MonoInitialiser, insert_first_keyframes
+from seamark.frontend.motion_mask import MotionMasks
 from seamark.frontend.pose import PoseEstimate, motion_covariance
 from seamark.frontend.recovery import recover
 from seamark.frontend.session import Session
-from seamark.frontend.tracks import Tracks
+from seamark.frontend.tracks import TrackAges, Tracks
 from seamark.frontend.types import Frame, Keyframe, Mode, Odometry, Outcome, Quality, Rig
 
 
@@ -51,8 +53,8 @@ class Frontend:
 
     One code path serves mono, stereo and RGB-D; they differ in the depth sensor. Mode ``PLACES`` makes every frame a
     keyframe without a pose; there a calibration holds for images of its size, others are taken as without. Raises
-    CalibrationError when the mode needs what the rig does not have. ``clock`` (seconds) measures stages for the report
-    and decides nothing.
+    CalibrationError when the mode needs what the rig does not have, MaskError for a bad mask file. ``clock`` (seconds)
+    measures stages for the report and decides nothing.
     """
 
     def __init__(
@@ -70,12 +72,18 @@ class Frontend:
         self._initialiser: MonoInitialiser | None = None
         self._grey: NDArray[np.uint8] | None = None
         self._stamps = StampGate(mode, config)
+        camera = rig.cam0 if rig is not None and mode is not Mode.PLACES else None
+        self._mask = read_mask(config.mask_file, camera) if config.mask_file is not None else None
+        self._ages = TrackAges()
+        self._motion: MotionMasks | None = None
         self._next_session = 0
         self._T_odom_start = se3.T_WORLD_LEVEL_CAM.copy()
 
     def step(self, frame: Frame) -> FrontendResult:
         """Process one frame; frames come in the order of their stamps."""
         refused = refusal(frame, self._rig, self._mode) or self._stamps.admit(frame.stamp_ns)
+        if self._mask is not None and self._mask.shape == frame.image.shape[:2]:
+            frame = replace(frame, mask=combined(self._mask, frame.mask))
         if refused is not None and refused is not Outcome.CLOCK_RESET:
             odometry = report(frame, refused, Quality.LOST)
         elif self._mode is Mode.PLACES:
@@ -110,6 +118,8 @@ class Frontend:
             return self._start(frame, grey)
 
         tracks, was = tracker.follow(session, before, grey, predict=self._initialiser is None)
+        usable = allowed(frame.mask, tracks.pixels)
+        tracks, was = tracks[usable], was[usable]
         watch.lap("track")
         if self._initialiser is not None:
             return self._initialise(session, self._initialiser, frame, grey, tracks)
@@ -125,22 +135,31 @@ class Frontend:
         watch.lap("settle")
 
         session.move(frame.stamp_ns, pose.T_odom_cam, tracks[keep])
+        ages = self._ages.step(session.id, session.tracks.ids)
+        moving = self._motion.step(grey, frame.stamp_ns, pose.T_odom_cam, session.distance()) if self._motion else None
         keyframe_id = None
         if tracker.keyframe_due(session, frame.stamp_ns, int(pose.inliers.sum())):
             keyframe_id = self._insert_keyframe(session, frame, grey, pose.covariance)
             watch.lap("keyframe")
         arrows = np.hstack([tracks.pixels, was])[keep]
-        return self._tracked(session, frame, pose, Outcome.TRACKED, keyframe_id, arrows, watch.stages_ms)
+        odometry = self._tracked(session, frame, pose, Outcome.TRACKED, keyframe_id, arrows, watch.stages_ms)
+        return replace(odometry, track_ages=ages, motion_mask=moving)
 
     def _insert_keyframe(
         self, session: Session, frame: Frame, grey: NDArray[np.uint8], covariance: NDArray[np.float64] | None
-    ) -> int:
-        """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way."""
-        previous = session.window[-1] if session.window else None
+    ) -> int | None:
+        """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way.
+
+        Returns its id, or None where it serves the window only and the map is spared one more of the same.
+        """
+        previous = session.mapped
+        keyframe_id = self._builder.next_id if tracker.map_keyframe_due(session, frame.stamp_ns) else None
         session.revisit(grey)
-        session.add_corners(grey)
+        session.add_corners(grey, frame.mask)
         depths = self._sensor.inverse_depth(frame, session.tracks.pixels)
-        session.insert_keyframe(self._builder.next_id, frame.stamp_ns, grey, session.T_odom_cam, *depths)
+        session.insert_keyframe(keyframe_id, frame.stamp_ns, grey, session.T_odom_cam, *depths)
+        if keyframe_id is None:
+            return None
         motion = None
         if previous is not None and covariance is not None:
             motion = motion_covariance(previous.T_odom_cam, session.T_odom_cam, covariance)
@@ -157,13 +176,14 @@ class Frontend:
         session = Session(
             self._next_session, self._config, self._rig.cam0, not mono, self._T_odom_start, self._depth_offset
         )
-        session.add_corners(grey)
+        session.add_corners(grey, frame.mask)
         inverse, _ = self._sensor.inverse_depth(frame, session.tracks.pixels)
         usable = len(session.tracks) if mono else int(np.isfinite(inverse).sum())
         if usable < MIN_CORNERS:
             self._session = None
             return report(frame, Outcome.LOST, Quality.LOST, loss=loss_of(grey, self._config.min_corner_response))
         self._session = session
+        self._motion = MotionMasks(self._rig.cam0.fx) if self._config.motion_masks else None
         session.last_pose_stamp_ns = frame.stamp_ns
         self._next_session += 1
         if mono:
@@ -197,7 +217,7 @@ class Frontend:
             if not initialiser.exhausted:
                 return report(frame, Outcome.INITIALISING, Quality.LOST, session=session.id)
             session.tracks = Tracks.none()
-            session.add_corners(grey)
+            session.add_corners(grey, frame.mask)
             return self._begin_initialising(session, frame)
 
         two_view, ids = result
@@ -256,7 +276,8 @@ class Frontend:
         arrows: NDArray[np.float32],
         stages_ms: dict[str, float],
     ) -> Odometry:
-        inliers, reference = int(pose.inliers.sum()), session.reference
+        inliers, reference = int(pose.inliers.sum()), session.mapped
+        assert reference is not None, "the first keyframe of a session is one of the map"
         return report(
             frame,
             outcome,
@@ -271,6 +292,7 @@ class Frontend:
             keyframe_id=keyframe_id,
             tracks=arrows,
             stages_ms=stages_ms,
+            near_share=session.near_share(),
         )
 
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
-from seamark.frontend.corners import detect_corners
 from seamark.frontend.depth_offset import DepthOffset
+from seamark.frontend.detectors import find_corners
+from seamark.frontend.masks import Mask
 from seamark.frontend.pose import Prediction
 from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.residuals import Observations
@@ -20,6 +21,7 @@ from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe
 
 OUTLIER_PX = 4.0
 TRIANGULATED_SPREAD = 0.2  # a distance less certain than this is triangulated anew where two views allow it
+NEAR_SPREAD = 0.1  # of the distance: what is known so well holds the translation
 PREDICTION_SHARE = 0.5  # of the last step and
 PREDICTION_OF_DEPTH = 0.02  # of the depth of the scene: how far constant velocity may be wrong
 
@@ -28,8 +30,9 @@ PREDICTION_OF_DEPTH = 0.02  # of the depth of the scene: how far constant veloci
 class Session:
     """Mutable state between frames.
 
-    ``velocity`` is T_last_next of the last step, ``reference`` the newest keyframe, ``archive`` those that have left
-    the window, and ``anchors`` the archived ones whose landmarks the newest keyframe sees again.
+    ``velocity`` is T_last_next of the last step, ``reference`` the newest keyframe, ``mapped`` the newest that the map
+    knows as well: the window wants more of them than a map is worth. ``archive`` are those that have left the window,
+    and ``anchors`` the archived ones whose landmarks the newest keyframe sees again.
     """
 
     id: int
@@ -43,6 +46,7 @@ class Session:
     window: list[WindowKeyframe] = field(default_factory=list)
     archive: list[WindowKeyframe] = field(default_factory=list)
     anchors: list[WindowKeyframe] = field(default_factory=list)
+    mapped: WindowKeyframe | None = None
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     last_pose_stamp_ns: int = 0
     n_at_keyframe: int = 0
@@ -60,17 +64,9 @@ class Session:
         self.tracks = self.tracks + fresh
         return fresh
 
-    def add_corners(self, grey: NDArray[np.uint8]) -> None:
-        """Begin tracks at new corners of a grey image where there are none."""
-        c = self.config
-        corners = detect_corners(
-            grey,
-            self.tracks.pixels,
-            c.max_corners,
-            harris=c.corner_detector == "harris",
-            min_response=c.min_corner_response,
-        )
-        self.new_tracks(corners)
+    def add_corners(self, grey: NDArray[np.uint8], mask: Mask | None) -> None:
+        """Begin tracks at new corners of a grey image where there are none and the mask is not zero."""
+        self.new_tracks(find_corners(grey, self.tracks.pixels, self.config, mask))
 
     def move(self, stamp_ns: int, T_odom_cam: NDArray[np.float64], tracks: Tracks) -> None:
         """Take a new pose and the tracks seen from it."""
@@ -95,10 +91,20 @@ class Session:
     def prediction(self) -> Prediction:
         """Return where constant velocity puts the camera next, and how far that may be wrong."""
         step = float(np.linalg.norm(self.velocity[:3, 3]))
+        uncertain = PREDICTION_SHARE * step + PREDICTION_OF_DEPTH * self.distance()
+        return Prediction(self.T_odom_cam @ self.velocity, uncertain)
+
+    def distance(self) -> float:
+        """Return the median distance of what is tracked, 1 where none is known."""
         positions = self.landmarks.get(self.tracks.ids)
         distance = np.linalg.norm(positions[np.isfinite(positions[:, 0])] - self.T_odom_cam[:3, 3], axis=1)
-        depth = float(np.median(distance)) if len(distance) else 1.0
-        return Prediction(self.T_odom_cam @ self.velocity, PREDICTION_SHARE * step + PREDICTION_OF_DEPTH * depth)
+        return float(np.median(distance)) if len(distance) else 1.0
+
+    def near_share(self) -> float:
+        """Return the share of the tracked landmarks whose distance is known to better than a tenth."""
+        spread = self.landmarks.spread(self.tracks.ids)
+        known = int(np.isfinite(spread).sum())
+        return float((spread < NEAR_SPREAD).sum()) / known if known else 0.0
 
     def revisit(self, grey: NDArray[np.uint8]) -> None:
         """Take up landmarks of archived keyframes that the current grey image shows again."""
@@ -117,7 +123,7 @@ class Session:
 
     def insert_keyframe(
         self,
-        keyframe_id: int,
+        keyframe_id: int | None,
         stamp_ns: int,
         grey: NDArray[np.uint8],
         T_odom_cam: NDArray[np.float64],
@@ -130,6 +136,8 @@ class Session:
         self.window.append(
             WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, grey, ids, seen, pixels, inverse_depth, inverse_sigma)
         )
+        if keyframe_id is not None:
+            self.mapped = self.reference
         self._landmarks_from_parallax()
         while len(self.window) > self.config.window_keyframes:
             self.archive.append(self.window.pop(0))
@@ -227,6 +235,7 @@ class Session:
         adjusted = result.poses[len(self.anchors) :]
         self.window = [replace(k, T_odom_cam=T) for k, T in zip(self.window, adjusted, strict=True)]
         # each observation is in as many windows as there are keyframes in one
+        self.mapped = next((k for k in self.window if self.mapped and k.id == self.mapped.id), self.mapped)
         information = result.depth_information / c.window_keyframes
         self.depth_offset = self.depth_offset.learned(result.depth_offset, information)
 
