@@ -1,13 +1,16 @@
 """Rendered revisits against the truth that follows from depth and poses; skipped where nothing can render."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from seamark.datasets_synth import sensor, specification
 from seamark.datasets_synth.ground_truth import epipolar_distances, flow, place_truth
-from seamark.datasets_synth.rendering import NoVulkanDevice, require_renderer
+from seamark.datasets_synth.panels import Panel
+from seamark.datasets_synth.rendering import NoVulkanDevice, render_some, require_renderer
 from seamark.datasets_synth.scenario import open_synth
 from seamark.datasets_synth.sequence import SynthSequence
 from seamark.datasets_synth.writing import write_sequence
@@ -64,6 +67,38 @@ def test_revisits_share_surface_and_obey_the_epipolar_geometry(lap: tuple[SynthS
     far = np.unravel_index(overlap.argmin(), overlap.shape)
     assert overlap[far] == 0
     assert len(_matches(frames[int(far[0])], frames[int(far[1])])[0]) < 25
+
+
+def _nearest(panels: Sequence[Panel], eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Return how many times each ray (N, 3) fits between the eye and the first panel whose front it meets."""
+    nearest = np.full(len(rays), np.inf)
+    for panel in panels:
+        facing = rays @ panel.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            times = ((panel.corner - eye) @ panel.normal) / facing
+            places = eye + times[:, None] * rays - panel.corner
+            shares = [places @ edge / (edge @ edge) for edge in (panel.right, panel.down)]
+            inside = np.all([(share >= 0) & (share <= 1) for share in shares], axis=0)
+        met = inside & (facing < 0) & (times > 0.05)
+        nearest[met] = np.minimum(nearest[met], times[met])
+    return nearest
+
+
+def test_depth_of_an_ideal_sensor_is_where_rays_meet_the_world(cache: Path) -> None:
+    wanted = specification.parse(SPEC + ",sensor=ideal")
+    world, camera = wanted.build(), wanted.rig.cam0
+    columns, rows = (grid.ravel() for grid in np.meshgrid(np.arange(3, 320, 7), np.arange(3, 240, 7)))
+    rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64))
+    for coded in render_some(wanted, [0, 17, 40]):
+        depth = sensor.decode(coded, 0, "").depth
+        assert depth is not None
+        measured = depth[rows, columns] / wanted.rig.depth_factor
+        T_world_cam = wanted.poses()[coded.index]
+        expected = _nearest(world.panels, T_world_cam[:3, 3], rays @ T_world_cam[:3, :3].T)
+        errors = np.abs(measured - expected)[expected < 13]
+        assert len(errors) > 1200
+        assert 0 < np.median(errors) < 0.0002
+        assert np.mean(errors < 0.001) > 0.99  # half a pixel is 17 mm on the floor 3 m away
 
 
 def test_flow_agrees_with_rendered_pictures(lap: tuple[SynthSequence, list[Frame]]) -> None:
