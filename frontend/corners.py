@@ -13,7 +13,7 @@ BLOCK_PX = 5
 BORDER_PX = 8
 RELATIVE_RESPONSE = 0.002  # of the image's strongest corners: keeps dark and low-texture images populated
 NOISE_RESPONSE = 3.0  # noise alone reaches 2.1 times its variance in an image
-LEAST_RESPONSE = 2e-6  # what rounding to whole grey levels can hide
+LEAST_RESPONSE = 6e-6  # the contours that rounding to whole grey levels makes of smooth shading reach 5e-6
 _NOISE_FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # blind to edges and ramps
 SUBPIXEL = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 0.02)
 

@@ -113,7 +113,7 @@ def insert_first_keyframes(
     session.insert_keyframe(a.id, first.stamp_ns, grey_of(initialiser.first.image), T_odom_first, unknown, unknown)
 
     session.tracks = live
-    session.add_corners(grey)
+    session.add_corners(grey, frame.mask)
     unknown = np.full(len(session.tracks), np.nan)
     session.insert_keyframe(
         builder.next_id, frame.stamp_ns, grey, T_odom_first @ two_view.T_first_second, unknown, unknown
