@@ -61,25 +61,54 @@ SEAMARK_INLINE void centre(Lanes* patch) {
 
 SEAMARK_INLINE bool sane(const float* p) { return std::fabs(p[0]) < kFar && std::fabs(p[1]) < kFar; }
 
-// Reads 24 x 18 pixels whose top left one is (left, top), of which there are more at the borders than the image has.
-SEAMARK_INLINE void read(const Image& image, int left, int top, float pixels[kRows + 1][kStride]) {
-    const bool inside = left >= 0 && top >= 0 && left + kStride <= image.width && top + kRows + 1 <= image.height;
-    for (int y = 0; y <= kRows; ++y) {
-        const int row = std::min(std::max(top + y, 0), image.height - 1);
-        const uint8_t* from = image.pixels + static_cast<int64_t>(row) * image.width;
-        if (inside)
-            for (int x = 0; x < kStride; ++x) pixels[y][x] = from[left + x];
-        else
-            for (int x = 0; x < kStride; ++x) pixels[y][x] = from[std::min(std::max(left + x, 0), image.width - 1)];
+SEAMARK_INLINE int clamped(int i, int n) { return std::min(std::max(i, 0), n - 1); }
+SEAMARK_INLINE int mirrored(int i, int n) { return clamped(i < 0 ? -i : i >= n ? 2 * n - 2 - i : i, n); }
+
+// Interpolates between the rows and columns of 16 x 24 values.
+SEAMARK_INLINE void between(const float values[kSide + 1][kStride], float u, float v, Lanes* out) {
+    for (int y = 0; y < kSide; ++y) {
+        Lanes at[2][2];
+        for (int i = 0; i < 2; ++i)
+            for (int j = 0; j < 2; ++j) load(values[y + i] + j, at[i][j]);
+        const Lanes left = at[0][0] + v * (at[1][0] - at[0][0]), right = at[0][1] + v * (at[1][1] - at[0][1]);
+        out[y] = left + u * (right - left);
     }
+}
+
+// The same as below where the patch reaches the border: values beyond are those of the border, and no gradient leads
+// across it, so that what is not in the image does not pull.
+SEAMARK_INLINE void sample_at_border(const Image& image, int left, int top, float u, float v, Patch& out) {
+    float grey[kSide + 1][kStride], across[kSide + 1][kStride], down[kSide + 1][kStride];
+    for (int i = 0; i <= kSide; ++i)
+        for (int j = 0; j < kStride; ++j) {
+            const int x = clamped(left + j, image.width), y = clamped(top + i, image.height);
+            float at[3][3];
+            for (int dy = -1; dy <= 1; ++dy)
+                for (int dx = -1; dx <= 1; ++dx)
+                    at[dy + 1][dx + 1] = image.pixels[static_cast<int64_t>(mirrored(y + dy, image.height)) * image.width +
+                                                      mirrored(x + dx, image.width)];
+            grey[i][j] = at[1][1];
+            across[i][j] = (3 * (at[0][2] - at[0][0] + at[2][2] - at[2][0]) + 10 * (at[1][2] - at[1][0])) / 32;
+            down[i][j] = (3 * (at[2][0] - at[0][0] + at[2][2] - at[0][2]) + 10 * (at[2][1] - at[0][1])) / 32;
+        }
+    between(grey, u, v, out.image);
+    between(across, u, v, out.gradient_x);
+    between(down, u, v, out.gradient_y);
+    centre(out.image);
 }
 
 // Reads the patch around a point, taking off its mean; with gradients in grey levels per pixel.
 SEAMARK_INLINE void sample(const Image& image, const float* point, Patch& out) {
     const float floor_x = std::floor(point[0]), floor_y = std::floor(point[1]);
     const float u = point[0] - floor_x, v = point[1] - floor_y;
+    const int left = static_cast<int>(floor_x) - kAround, top = static_cast<int>(floor_y) - kAround;
+    if (left < 0 || top < 0 || left + kStride > image.width || top + kRows + 1 > image.height) {
+        sample_at_border(image, left + 1, top + 1, u, v, out);
+        return;
+    }
     float pixels[kRows + 1][kStride], samples[kRows][kStride];
-    read(image, static_cast<int>(floor_x) - kAround, static_cast<int>(floor_y) - kAround, pixels);
+    for (int y = 0; y <= kRows; ++y)
+        for (int x = 0; x < kStride; ++x) pixels[y][x] = image.pixels[static_cast<int64_t>(top + y) * image.width + left + x];
     for (int y = 0; y < kRows; ++y) {
         float column[kStride];
         for (int x = 0; x < kStride; ++x) column[x] = pixels[y][x] + v * (pixels[y + 1][x] - pixels[y][x]);
