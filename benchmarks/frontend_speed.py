@@ -19,7 +19,7 @@ import numpy as np
 
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.odometry import Frontend
-from seamark.service.evaluation import Alignment, associate, ate
+from seamark.service.evaluation import Alignment, ate
 from seamark.service.sources.open import open_sources
 from seamark.service.types import Trajectory
 
