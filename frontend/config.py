@@ -48,6 +48,13 @@ class FrontendConfig(BaseModel):
     )
     keyframe_rotation_deg: float = Field(15.0, gt=0, description="rotation of a new keyframe against the last")
     keyframe_tracked_ratio: float = Field(0.6, gt=0, lt=1, description="share of the keyframe's landmarks still seen")
+    keyframe_shared_ratio: float = Field(
+        0.4,
+        ge=0,
+        lt=1,
+        description="share of the tracks of the map's last keyframe, still followed, above which "
+        "a keyframe of the window is not worth one of the map",
+    )
     window_keyframes: int = Field(8, ge=3, le=30, description="keyframes adjusted together")
     window_iterations: int = Field(6, ge=1, le=50, description="Levenberg-Marquardt steps at most")
 

@@ -147,13 +147,19 @@ class Frontend:
 
     def _insert_keyframe(
         self, session: Session, frame: Frame, grey: NDArray[np.uint8], covariance: NDArray[np.float64] | None
-    ) -> int:
-        """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way."""
-        previous = session.window[-1] if session.window else None
+    ) -> int | None:
+        """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way.
+
+        Returns its id, or None where it serves the window only and the map is spared one more of the same.
+        """
+        previous = session.mapped
+        keyframe_id = self._builder.next_id if tracker.map_keyframe_due(session, frame.stamp_ns) else None
         session.revisit(grey)
         session.add_corners(grey, frame.mask)
         depths = self._sensor.inverse_depth(frame, session.tracks.pixels)
-        session.insert_keyframe(self._builder.next_id, frame.stamp_ns, grey, session.T_odom_cam, *depths)
+        session.insert_keyframe(keyframe_id, frame.stamp_ns, grey, session.T_odom_cam, *depths)
+        if keyframe_id is None:
+            return None
         motion = None
         if previous is not None and covariance is not None:
             motion = motion_covariance(previous.T_odom_cam, session.T_odom_cam, covariance)
@@ -270,7 +276,8 @@ class Frontend:
         arrows: NDArray[np.float32],
         stages_ms: dict[str, float],
     ) -> Odometry:
-        inliers, reference = int(pose.inliers.sum()), session.reference
+        inliers, reference = int(pose.inliers.sum()), session.mapped
+        assert reference is not None, "the first keyframe of a session is one of the map"
         return report(
             frame,
             outcome,

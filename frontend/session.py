@@ -30,8 +30,9 @@ PREDICTION_OF_DEPTH = 0.02  # of the depth of the scene: how far constant veloci
 class Session:
     """Mutable state between frames.
 
-    ``velocity`` is T_last_next of the last step, ``reference`` the newest keyframe, ``archive`` those that have left
-    the window, and ``anchors`` the archived ones whose landmarks the newest keyframe sees again.
+    ``velocity`` is T_last_next of the last step, ``reference`` the newest keyframe, ``mapped`` the newest that the map
+    knows as well: the window wants more of them than a map is worth. ``archive`` are those that have left the window,
+    and ``anchors`` the archived ones whose landmarks the newest keyframe sees again.
     """
 
     id: int
@@ -45,6 +46,7 @@ class Session:
     window: list[WindowKeyframe] = field(default_factory=list)
     archive: list[WindowKeyframe] = field(default_factory=list)
     anchors: list[WindowKeyframe] = field(default_factory=list)
+    mapped: WindowKeyframe | None = None
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     last_pose_stamp_ns: int = 0
     n_at_keyframe: int = 0
@@ -121,7 +123,7 @@ class Session:
 
     def insert_keyframe(
         self,
-        keyframe_id: int,
+        keyframe_id: int | None,
         stamp_ns: int,
         grey: NDArray[np.uint8],
         T_odom_cam: NDArray[np.float64],
@@ -134,6 +136,8 @@ class Session:
         self.window.append(
             WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, grey, ids, seen, pixels, inverse_depth, inverse_sigma)
         )
+        if keyframe_id is not None:
+            self.mapped = self.reference
         self._landmarks_from_parallax()
         while len(self.window) > self.config.window_keyframes:
             self.archive.append(self.window.pop(0))
@@ -231,6 +235,7 @@ class Session:
         adjusted = result.poses[len(self.anchors) :]
         self.window = [replace(k, T_odom_cam=T) for k, T in zip(self.window, adjusted, strict=True)]
         # each observation is in as many windows as there are keyframes in one
+        self.mapped = next((k for k in self.window if self.mapped and k.id == self.mapped.id), self.mapped)
         information = result.depth_information / c.window_keyframes
         self.depth_offset = self.depth_offset.learned(result.depth_offset, information)
 

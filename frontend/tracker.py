@@ -13,6 +13,7 @@ from seamark.frontend.tone import match_tone
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import rotation_compensated_parallax
 from seamark.frontend.types import Frame
+from seamark.frontend.window import WindowKeyframe
 
 GUESS_DEPTH = 1e3  # tracks without a landmark move as if far away: by the rotation only
 RETRY_SURVIVORS = 0.5
@@ -145,18 +146,33 @@ def patch_warps(
 
 def keyframe_due(session: Session, stamp_ns: int, n_inliers: int) -> bool:
     """Decide by what is still seen, rotation, parallax and the sensor's time, never by another clock."""
-    c, reference = session.config, session.reference
+    c = session.config
     if n_inliers < max(c.good_inliers, c.keyframe_tracked_ratio * session.n_at_keyframe):
         return True
-    R_reference_cam = reference.T_odom_cam[:3, :3].T @ session.T_odom_cam[:3, :3]
-    if float(se3.rotation_angle(R_reference_cam)) > np.deg2rad(c.keyframe_rotation_deg):
+    return _moved_on(session, session.reference, stamp_ns) or map_keyframe_due(session, stamp_ns)
+
+
+def map_keyframe_due(session: Session, stamp_ns: int) -> bool:
+    """Decide whether the view differs enough from the newest keyframe of the map to be one more."""
+    mapped = session.mapped
+    if mapped is None:
         return True
-    _, i, j = np.intersect1d(reference.track_ids, session.tracks.ids, assume_unique=True, return_indices=True)
+    shared = np.isin(mapped.track_ids, session.tracks.ids).sum()
+    if shared < max(session.config.good_inliers, session.config.keyframe_shared_ratio * len(mapped.track_ids)):
+        return True
+    return _moved_on(session, mapped, stamp_ns)
+
+
+def _moved_on(session: Session, keyframe: WindowKeyframe, stamp_ns: int) -> bool:
+    """Return whether the camera has turned or moved far since a keyframe, or at all within a long time."""
+    c = session.config
+    R_keyframe_cam = keyframe.T_odom_cam[:3, :3].T @ session.T_odom_cam[:3, :3]
+    if float(se3.rotation_angle(R_keyframe_cam)) > np.deg2rad(c.keyframe_rotation_deg):
+        return True
+    _, i, j = np.intersect1d(keyframe.track_ids, session.tracks.ids, assume_unique=True, return_indices=True)
     if len(i) == 0:
         return True
     rays = session.camera.rays(session.tracks.pixels[j])
-    parallax = float(
-        np.median(rotation_compensated_parallax(R_reference_cam, reference.pixels[i], rays, session.camera))
-    )
-    waited_s = 1e-9 * (stamp_ns - reference.stamp_ns)
+    parallax = float(np.median(rotation_compensated_parallax(R_keyframe_cam, keyframe.pixels[i], rays, session.camera)))
+    waited_s = 1e-9 * (stamp_ns - keyframe.stamp_ns)
     return parallax > c.keyframe_parallax_px or (waited_s > c.keyframe_max_gap_s and parallax > STILL_PX)
