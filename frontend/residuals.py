@@ -1,4 +1,7 @@
-"""How landmarks are seen: whitened errors of pixels and inverse depths, and how they change with pose and landmark."""
+"""How landmarks are seen: whitened errors of pixels and inverse depths, and how they change with the landmark.
+
+The kernels have the same in native/seen.hpp, with what follows from it for poses.
+"""
 
 from dataclasses import dataclass
 
@@ -7,8 +10,6 @@ from numpy.typing import NDArray
 
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
-
-HUBER = 1.345
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,31 +65,6 @@ def residuals_and_jacobian(
     return residuals, J
 
 
-def pose_jacobian(in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivative (N, 3, 6) of points in the camera by a right perturbation of T_odom_cam, rotation first."""
-    x, y, z = in_cam.T
-    J = np.zeros((len(in_cam), 3, 6))
-    J[:, 0, 1], J[:, 0, 2] = -z, y
-    J[:, 1, 0], J[:, 1, 2] = z, -x
-    J[:, 2, 0], J[:, 2, 1] = -y, x
-    J[:, :, 3:] = -np.eye(3)
-    return J
-
-
-def retract(T: NDArray[np.float64], delta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Apply a small tangent step (6,), rotation first, on the right."""
-    return T @ se3.make(se3.exp_rotation(delta[:3]), delta[3:])
-
-
-def robust_weights(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Huber's weights (N, 3) of whitened residuals (N, 3): one for both pixel rows, one for the depth row."""
-    pixel = np.linalg.norm(residuals[:, :2], axis=1)
-    depth = np.abs(residuals[:, 2])
-    w_pixel = np.minimum(1, HUBER / np.maximum(pixel, 1e-12))
-    w_depth = np.minimum(1, HUBER / np.maximum(depth, 1e-12))
-    return np.column_stack([w_pixel, w_pixel, w_depth])
-
-
 def shift_of_distance(
     T_odom_cam: NDArray[np.float64],
     in_cam: NDArray[np.float64],
@@ -101,13 +77,3 @@ def shift_of_distance(
     along = (in_cam - origin) * observations.spread[:, None]
     shift: NDArray[np.float64] = (J_point[:, :2] @ along[:, :, None])[:, :, 0]
     return shift
-
-
-def discount(shift: NDArray[np.float64], *rows: NDArray[np.float64]) -> None:
-    """Whiten pixel rows (N, 2, ...), in place, whose covariance is 1 + shift shift^T."""
-    square = (shift * shift).sum(axis=1)
-    share = np.where(square > 1e-12, (1 - 1 / np.sqrt(1 + square)) / np.maximum(square, 1e-12), 0)
-    for row in rows:
-        flat = row[..., None] if row.ndim == 2 else row
-        along = np.einsum("ni,nij->nj", shift, flat) * share[:, None]
-        flat -= shift[:, :, None] * along[:, None]

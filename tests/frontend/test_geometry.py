@@ -11,12 +11,28 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.pose import Prediction, estimate_pose, refine_pose
 from seamark.frontend.presumed import SPREAD, presume
-from seamark.frontend.residuals import Observations, pose_jacobian, residuals_and_jacobian, retract
+from seamark.frontend.residuals import Observations, residuals_and_jacobian
 from seamark.frontend.session import Session
 from seamark.frontend.two_view import initialise, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, adjust
 
 CAMERA = Camera(640, 480, 400, 410, 321, 239)
+
+
+def pose_jacobian(in_cam: np.ndarray) -> np.ndarray:
+    """Return the derivative (N, 3, 6) of points in the camera by a right perturbation of T_odom_cam, rotation first."""
+    x, y, z = in_cam.T
+    J = np.zeros((len(in_cam), 3, 6))
+    J[:, 0, 1], J[:, 0, 2] = -z, y
+    J[:, 1, 0], J[:, 1, 2] = z, -x
+    J[:, 2, 0], J[:, 2, 1] = -y, x
+    J[:, :, 3:] = -np.eye(3)
+    return J
+
+
+def retract(T: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    """Apply a small tangent step (6,), rotation first, on the right."""
+    return T @ se3.make(se3.exp_rotation(delta[:3]), delta[3:])
 
 
 def scene(rng: np.random.Generator, n: int = 120) -> np.ndarray:
