@@ -13,6 +13,7 @@ from seamark.backend.consistency import gate_chi2
 from seamark.backend.errors import BackendInputError
 from seamark.backend.graph_types import Constraint, Node, Solver, check_node
 from seamark.backend.ledger import Finding, Key, LoopLedger, PlaceRelation, PoseRelation
+from seamark.backend.likelihood import probability
 from seamark.backend.map_state import MapState
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.backend.verify import Rejected, Verification, verify
@@ -121,7 +122,8 @@ class Slam:
         for candidate in self._islands(candidates, known, None):
             match = known[candidate.id]
             result = verify(query, match, self._config.verification, self._pair_seed(query.id, match.id))
-            places.append(self._place(candidate, match, result))
+            likely = probability(query, match, candidate.score)
+            places.append(self._place(candidate, match, result, likely))
         return tuple(sorted(places, key=lambda place: (not place.accepted, -place.inliers)))
 
     def _add(self, keyframe: Keyframe) -> None:
@@ -258,7 +260,7 @@ class Slam:
             self._map.take(estimate)
         return True
 
-    def _place(self, candidate: Candidate, match: Keyframe, result: Verification | Rejected) -> Place:
+    def _place(self, candidate: Candidate, match: Keyframe, result: Verification | Rejected, likely: float) -> Place:
         """Say what the comparison of a query image with one keyframe means."""
         reason, T_map_cam = Reason.ACCEPTED, None
         if isinstance(result, Rejected):
@@ -280,6 +282,8 @@ class Slam:
             accepted=reason == Reason.ACCEPTED,
             reason=reason,
             T_map_cam=T_map_cam,
+            view=candidate.view,
+            probability=likely,
         )
 
     def _pair_seed(self, query_id: int, match_id: int) -> int:

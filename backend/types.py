@@ -67,7 +67,8 @@ class Place:
     """One ranked answer to the question "have I been here?".
 
     ``inliers`` is 0 where geometry was not tried or failed. ``T_map_cam`` is the query camera's pose in the map, None
-    when it was not localised.
+    when it was not localised. ``view`` is the likeness of the edges of the whole images, 0..1, ``probability`` that of
+    both showing one place, by looks alone.
     """
 
     keyframe_id: int
@@ -81,3 +82,5 @@ class Place:
     accepted: bool
     reason: Reason
     T_map_cam: Matrix | None = None
+    view: float = 0.0
+    probability: float = 0.0

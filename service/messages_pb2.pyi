@@ -197,16 +197,18 @@ class PlaceObservation(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., descriptors: _Optional[_Union[Array, _Mapping]] = ..., points: _Optional[_Union[Array, _Mapping]] = ..., thumbnail: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Candidate(_message.Message):
-    __slots__ = ("id", "score", "votes", "jeffrey")
+    __slots__ = ("id", "score", "votes", "jeffrey", "view")
     ID_FIELD_NUMBER: _ClassVar[int]
     SCORE_FIELD_NUMBER: _ClassVar[int]
     VOTES_FIELD_NUMBER: _ClassVar[int]
     JEFFREY_FIELD_NUMBER: _ClassVar[int]
+    VIEW_FIELD_NUMBER: _ClassVar[int]
     id: int
     score: float
     votes: float
     jeffrey: float
-    def __init__(self, id: _Optional[int] = ..., score: _Optional[float] = ..., votes: _Optional[float] = ..., jeffrey: _Optional[float] = ...) -> None: ...
+    view: float
+    def __init__(self, id: _Optional[int] = ..., score: _Optional[float] = ..., votes: _Optional[float] = ..., jeffrey: _Optional[float] = ..., view: _Optional[float] = ...) -> None: ...
 
 class Candidates(_message.Message):
     __slots__ = ("schema_version", "query_id", "stamp_ns", "ranked")
@@ -281,7 +283,7 @@ class PlaceQuery(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., image: _Optional[bytes] = ..., top_k: _Optional[int] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ...) -> None: ...
 
 class Place(_message.Message):
-    __slots__ = ("keyframe_id", "session", "stamp_ns", "file", "score", "votes", "jeffrey", "inliers", "accepted", "reason", "T_map_cam")
+    __slots__ = ("keyframe_id", "session", "stamp_ns", "file", "score", "votes", "jeffrey", "inliers", "accepted", "reason", "T_map_cam", "view", "probability")
     KEYFRAME_ID_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
@@ -293,6 +295,8 @@ class Place(_message.Message):
     ACCEPTED_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     T_MAP_CAM_FIELD_NUMBER: _ClassVar[int]
+    VIEW_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     keyframe_id: int
     session: int
     stamp_ns: int
@@ -304,21 +308,25 @@ class Place(_message.Message):
     accepted: bool
     reason: str
     T_map_cam: Array
-    def __init__(self, keyframe_id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., score: _Optional[float] = ..., votes: _Optional[float] = ..., jeffrey: _Optional[float] = ..., inliers: _Optional[int] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., T_map_cam: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
+    view: float
+    probability: float
+    def __init__(self, keyframe_id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., score: _Optional[float] = ..., votes: _Optional[float] = ..., jeffrey: _Optional[float] = ..., inliers: _Optional[int] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., T_map_cam: _Optional[_Union[Array, _Mapping]] = ..., view: _Optional[float] = ..., probability: _Optional[float] = ...) -> None: ...
 
 class PlaceReply(_message.Message):
-    __slots__ = ("schema_version", "places", "error_code", "error_message", "timings_ms")
+    __slots__ = ("schema_version", "places", "error_code", "error_message", "timings_ms", "verdict")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     PLACES_FIELD_NUMBER: _ClassVar[int]
     ERROR_CODE_FIELD_NUMBER: _ClassVar[int]
     ERROR_MESSAGE_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_MS_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     places: _containers.RepeatedCompositeFieldContainer[Place]
     error_code: str
     error_message: str
     timings_ms: _containers.RepeatedCompositeFieldContainer[Stage]
-    def __init__(self, schema_version: _Optional[int] = ..., places: _Optional[_Iterable[_Union[Place, _Mapping]]] = ..., error_code: _Optional[str] = ..., error_message: _Optional[str] = ..., timings_ms: _Optional[_Iterable[_Union[Stage, _Mapping]]] = ...) -> None: ...
+    verdict: str
+    def __init__(self, schema_version: _Optional[int] = ..., places: _Optional[_Iterable[_Union[Place, _Mapping]]] = ..., error_code: _Optional[str] = ..., error_message: _Optional[str] = ..., timings_ms: _Optional[_Iterable[_Union[Stage, _Mapping]]] = ..., verdict: _Optional[str] = ...) -> None: ...
 
 class Empty(_message.Message):
     __slots__ = ("schema_version",)

@@ -13,6 +13,7 @@ from seamark.service.results import pose_fields
 from seamark.service.stamps import format_stamp
 from seamark.service.zenoh_bus import ZenohBus
 from seamark.service.zenoh_session import CLIENT_CONNECT_TIMEOUT_S, open_session
+from seamark.vocab.confidence import Verdict
 
 
 class QueryError(SeamarkError):
@@ -53,12 +54,14 @@ def as_json(reply: PlaceReply) -> dict[str, Any]:
         }
         del row["stamp_ns"]
         places.append(row)
-    return {"places": places, "error": error, "timings_ms": reply.timings_ms}
+    verdict = None if reply.verdict is None else str(reply.verdict)
+    return {"places": places, "verdict": verdict, "error": error, "timings_ms": reply.timings_ms}
 
 
 def table(reply: PlaceReply) -> Table:
     """Return the answer as a table for the terminal."""
-    out = Table(title="Have I been here?")
+    said = "" if reply.verdict is None else f" {'yes' if reply.verdict == Verdict.ACCEPTED else reply.verdict}"
+    out = Table(title=f"Have I been here?{said}")
     for column in ("rank", "file", "stamp", "score", "votes", "jeffrey", "inliers", "verdict", "position in the map"):
         out.add_column(column)
     for rank, place in enumerate(reply.places, start=1):

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.types import Place
 from seamark.frontend.types import Camera
+from seamark.vocab.confidence import Verdict
 
 Picture = bytes | NDArray[np.uint8]
 DepthPicture = bytes | NDArray[np.uint16] | NDArray[np.float32]
@@ -53,12 +54,17 @@ class PlaceQuery:
 
 @dataclass(frozen=True, eq=False)
 class PlaceReply:
-    """Ranked places, best first, or a typed error; ``timings_ms`` per stage of the answer."""
+    """Ranked places, best first, or a typed error; ``timings_ms`` per stage of the answer.
+
+    ``verdict`` says whether the first place is the answer, or why the answer is "nothing here"; None where the query
+    was no question, or the service is older than verdicts.
+    """
 
     places: tuple[Place, ...] = ()
     error_code: PlaceError | None = None
     error_message: str = ""
     timings_ms: dict[str, float] = field(default_factory=dict)
+    verdict: Verdict | None = None
 
 
 @dataclass(frozen=True)

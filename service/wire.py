@@ -32,6 +32,7 @@ from seamark.service.wire_fields import (
     Text,
     Word,
 )
+from seamark.vocab.confidence import Verdict
 from seamark.vocab.types import Candidate, Candidates, PlaceObservation
 
 SCHEMA_VERSION = 1
@@ -139,7 +140,7 @@ _FILLED = Schema(
     Filled,
 )
 _CANDIDATE = Schema(
-    pb.Candidate, {"id": Integer(), "score": Number(), "votes": Number(), "jeffrey": Number()}, Candidate
+    pb.Candidate, {"id": Integer()} | {name: Number() for name in ("score", "votes", "jeffrey", "view")}, Candidate
 )
 _EVIDENCE: dict[str, Field] = {"score": Number(), "votes": Number(), "jeffrey": Number(), "inliers": Integer()}
 _VERDICT: dict[str, Field] = {"accepted": Flag(), "reason": Word(Reason)}
@@ -156,7 +157,7 @@ _PLACE = Schema(
     {"keyframe_id": Integer(), "session": Integer(), "stamp_ns": Integer(), "file": Text()}
     | _VERDICT
     | _EVIDENCE
-    | {"T_map_cam": Optional(_POSE)},
+    | {"T_map_cam": Optional(_POSE), "view": Number(), "probability": Number()},
     Place,
 )
 _COLOUR = Array(("uint8",), (None, None), (None, None, 3))
@@ -250,6 +251,7 @@ SCHEMAS: dict[type, Schema] = {
             "error_code": Optional(Word(PlaceError)),
             "error_message": Text(),
             "timings_ms": Map("ms", number=True),
+            "verdict": Optional(Word(Verdict)),
         },
         PlaceReply,
     ),

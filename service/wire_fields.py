@@ -7,7 +7,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-DTYPES = {name: np.dtype(name).newbyteorder("<") for name in ("uint8", "uint16", "int64", "float32", "float64")}
+DTYPES = {
+    name: np.dtype(name).newbyteorder("<") for name in ("uint8", "uint16", "int32", "int64", "float32", "float64")
+}
 MAX_DIMENSIONS = 4
 
 

@@ -1,21 +1,25 @@
 """Answers to "have I been here, and where am I?"."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.types import Place
+from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import extract_features, thumbnail_of
 from seamark.frontend.types import Keyframe
 from seamark.service.requests import PlaceError, PlaceQuery, PlaceReply
 from seamark.service.sources.decode import UnreadableImageError, decode, to_image
+from seamark.vocab.confidence import MIN_INLIERS, Verdict
 from seamark.vocab.types import Candidates, PlaceObservation
 
 QUERY_ID = -1
+RIVAL_SHARE = 0.5  # of the inliers of the first place: a place with so many is about as good
+ELSEWHERE_M, ELSEWHERE_DEG = 3.0, 30.0  # a map without scale has units of its own in place of metres
 
 
 class PlaceService:
@@ -51,7 +55,7 @@ class PlaceService:
         try:
             image = to_image(decode(query.image, "the query image"), "the query image")
         except UnreadableImageError as error:
-            return PlaceReply((), PlaceError.UNDECODABLE_IMAGE, str(error))
+            return PlaceReply((), PlaceError.UNDECODABLE_IMAGE, str(error), verdict=Verdict.UNREADABLE)
         camera = query.camera
         if camera is not None and (camera.height, camera.width) != image.shape[:2]:
             size = f"{image.shape[1]} x {image.shape[0]}"
@@ -62,14 +66,14 @@ class PlaceService:
         lap("features")
         if len(keyframe.features) == 0:
             message = "nothing in the query image can be recognised: it has no features"
-            return PlaceReply((), PlaceError.NO_FEATURES, message, timings_ms)
+            return PlaceReply((), PlaceError.NO_FEATURES, message, timings_ms, Verdict.NO_FEATURES)
         candidates = self._rank(_observe(keyframe))
         lap("rank")
         if not candidates.ranked:
-            return PlaceReply((), PlaceError.EMPTY_MAP, "the map has no places yet", timings_ms)
+            return PlaceReply((), PlaceError.EMPTY_MAP, "the map has no places yet", timings_ms, Verdict.EMPTY)
         places = self._locate(keyframe, candidates)
         lap("locate")
-        return PlaceReply(places[: query.top_k], timings_ms=timings_ms)
+        return PlaceReply(places[: query.top_k], timings_ms=timings_ms, verdict=judge(places))
 
     def _describe(self, query: PlaceQuery, image: NDArray[np.uint8], camera: Camera | None) -> Keyframe:
         own = self._camera
@@ -88,6 +92,28 @@ class PlaceService:
             jpeg=query.image,
             camera=camera,
         )
+
+
+def judge(places: Sequence[Place]) -> Verdict:
+    """Return what became of a query whose places, best first, have been verified.
+
+    Places that geometry confirms about as well as the first must put the camera where that puts it, else there are two
+    that look alike, and the answer is doubt.
+    """
+    accepted = [place for place in places if place.accepted]
+    if not accepted:
+        most = max((place.inliers for place in places), default=0)
+        return Verdict.FEW_INLIERS if most < MIN_INLIERS else Verdict.UNSURE
+    rivals = [place for place in accepted[1:] if place.inliers >= RIVAL_SHARE * accepted[0].inliers]
+    return Verdict.DOUBT if any(_elsewhere(accepted[0], rival) for rival in rivals) else Verdict.ACCEPTED
+
+
+def _elsewhere(one: Place, other: Place) -> bool:
+    if one.T_map_cam is None or other.T_map_cam is None:
+        return False
+    distance = float(np.linalg.norm(one.T_map_cam[:3, 3] - other.T_map_cam[:3, 3]))
+    turn = float(np.rad2deg(se3.rotation_angle(one.T_map_cam[:3, :3].T @ other.T_map_cam[:3, :3])))
+    return distance > ELSEWHERE_M or turn > ELSEWHERE_DEG
 
 
 def _observe(keyframe: Keyframe) -> PlaceObservation:

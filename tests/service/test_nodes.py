@@ -377,6 +377,9 @@ def test_bad_place_queries_have_typed_answers(query: PlaceQuery, code: PlaceErro
     BackendNode(bus.for_node("backend"), FakeSlam(), None, FrontendConfig())
     reply = bus.request(topics.PLACE, query)
     assert reply.error_code is code and reply.error_message and reply.places == ()
+    assert reply.verdict == {PlaceError.UNDECODABLE_IMAGE: "unreadable", PlaceError.NO_FEATURES: "no_features"}.get(
+        code
+    )
 
 
 def test_an_empty_map_is_told_from_an_unknown_place(frames: list[Frame], vocabulary: Vocabulary) -> None:

@@ -15,6 +15,7 @@ from seamark.service import messages_pb2 as pb
 from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery, PlaceReply, Status
 from seamark.service.topics import TOPICS
 from seamark.service.wire import SCHEMA_VERSION, SCHEMAS, WireError, decode, encode, encoding_of
+from seamark.vocab.confidence import Verdict
 from seamark.vocab.types import Candidate, Candidates, PlaceObservation
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -98,7 +99,7 @@ def messages() -> list[Any]:
         bare,
         odometry(),
         Odometry(0, 0, "", -1, Quality.LOST, Outcome.UNREADABLE),
-        Candidates(-1, 5, (Candidate(1, 0.5, 0.25, float("nan")), Candidate(0, 0.1, 0, 3))),
+        Candidates(-1, 5, (Candidate(1, 0.5, 0.25, float("nan")), Candidate(0, 0.1, 0, 3, 0.75))),
         Candidates(3, 5, ()),
         PlaceObservation(1, 0, 9, np.zeros((2, 128), np.uint8), np.zeros((2, 2), np.float32), grey),
         loop(),
@@ -108,9 +109,11 @@ def messages() -> list[Any]:
         PlaceQuery(b"image", 3, Camera(64, 48, 50, 50, 32, 24)),
         PlaceQuery(b"", 1),
         PlaceReply(
-            (Place(1, 0, 5, "a", 0.5, 0.4, 0.1, 30, True, Reason.ACCEPTED, np.eye(4)),), timings_ms={"sift": 9.5}
+            (Place(1, 0, 5, "a", 0.5, 0.4, 0.1, 30, True, Reason.ACCEPTED, np.eye(4), 0.4, 0.99),),
+            timings_ms={"sift": 9.5},
+            verdict=Verdict.ACCEPTED,
         ),
-        PlaceReply((), PlaceError.NO_FEATURES, "the image is blank"),
+        PlaceReply((), PlaceError.NO_FEATURES, "the image is blank", verdict=Verdict.NO_FEATURES),
         Empty(),
         Done("vocab"),
         Status("backend", 12, 10**10, 2 * 10**10, 1.5, {"loops": 3}, {"verify": [1.0, 2.0], "none": []}),
@@ -269,3 +272,18 @@ def test_fuzzed_bytes_decode_or_raise_wire_error(data: st.DataObject) -> None:
         assert isinstance(decode(blob, kind), (kind, EncodedFrame, Frame))
     except WireError as error:
         assert kind.__name__ in str(error)
+
+
+def test_what_was_added_may_be_missing_from_an_older_message() -> None:
+    old = pb.PlaceReply(schema_version=1, error_message="")
+    old.places.add(keyframe_id=3, reason="accepted", accepted=True)
+    reply = decode(old.SerializeToString(), PlaceReply)
+    assert reply.verdict is None and reply.places[0].view == reply.places[0].probability == 0.0
+    ranked = pb.Candidates(schema_version=1, query_id=2)
+    ranked.ranked.add(id=1, score=0.5)
+    assert decode(ranked.SerializeToString(), Candidates).ranked == (Candidate(1, 0.5, 0.0, 0.0, 0.0),)
+
+
+def test_an_unknown_verdict_is_malformed() -> None:
+    with pytest.raises(WireError, match="PlaceReply"):
+        decode(pb.PlaceReply(schema_version=1, verdict="perhaps").SerializeToString(), PlaceReply)
