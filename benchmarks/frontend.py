@@ -173,7 +173,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*")
     parser.add_argument("--worlds", action="store_true")
     parser.add_argument("--ablation", action="store_true")
-    wish = parser.parse_args()
+    wish = parser.parse_intermixed_args()
     cv2.setNumThreads(1)
     print(f"| {COLUMNS} |")
     print("|" + "---|" * len(COLUMNS.split("|")))
