@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -102,15 +103,15 @@ def test_turning_on_the_spot_invents_no_translation() -> None:
 
 
 def test_mono_keeps_its_session_where_the_camera_turns_faster_than_it_moves() -> None:
-    """Test: after 30 frames of a walk the camera turns by 90 degrees, three a frame, a centimetre a step.
+    """Test: after 30 frames of a walk the camera turns by 90 degrees, five a frame, two millimetres a step.
 
     Expected: nothing that is seen at the end was seen from two places, yet there is one session, the angle is right and
-    the step has not grown.
+    no way was invented (it is 4 cm; what the rotation is wrong by may look like a few more).
     """
     walked, truth = walk("line", 30, Mode.MONO)
     T, frames, true = truth[29], list(walked), list(truth[:30])
-    for k in range(30):
-        T = T @ se3.make(se3.exp_rotation(np.array([0.0, np.deg2rad(3.0), 0.0])), np.array([0.01, 0.0, 0.0]))
+    for k in range(18):
+        T = T @ se3.make(se3.exp_rotation(np.array([0.0, np.deg2rad(5.0), 0.0])), np.array([0.002, 0.0, 0.0]))
         true.append(T)
         stamp_ns = walked[-1].stamp_ns + (k + 1) * (walked[1].stamp_ns - walked[0].stamp_ns)
         frames.append(Frame(30 + k, stamp_ns, WORLD.view(T)[0]))
@@ -119,13 +120,11 @@ def test_mono_keeps_its_session_where_the_camera_turns_faster_than_it_moves() ->
     assert all(o.T_odom_cam is not None for o in odometry[start:])
     assert {o.session for o in odometry} == {0}
     estimated = np.stack([o.T_odom_cam for o in odometry[start:]])
-    turned = estimated[-31][:3, :3].T @ estimated[-1][:3, :3]
+    turned = estimated[-19][:3, :3].T @ estimated[-1][:3, :3]
     assert np.rad2deg(se3.rotation_angle(turned)) == pytest.approx(90, abs=1.5)
-    before, after = (
-        np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in ((estimated[0], estimated[-31]), estimated[-31::30])
-    )
-    ratio = np.linalg.norm(true[59][:3, 3] - true[29][:3, 3]) / np.linalg.norm(true[29][:3, 3] - true[start][:3, 3])
-    assert 0.3 * ratio < after / before < 3 * ratio
+    walked_m, turning_m = (np.linalg.norm(b - a) for a, b in pairwise(estimated[[0, -19, -1], :3, 3]))
+    true_m = np.linalg.norm(truth[29, :3, 3] - truth[start, :3, 3])
+    assert turning_m * true_m / walked_m < 0.2
 
 
 def test_same_frames_same_bits() -> None:
