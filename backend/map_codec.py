@@ -1,29 +1,27 @@
-"""Keyframes and loops to and from the columns of a map on disk."""
+"""Keyframes and loops to and from the rows of a map on disk; see map_schema.py for the columns."""
 
 import json
 import sqlite3
 import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.errors import MapCorruptError
 from seamark.backend.types import Loop, Reason
+from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.types import Features, Keyframe
 
-_DTYPES = {"f4": np.float32, "f8": np.float64, "u1": np.uint8}
-_ARRAY_COLUMNS = ("points", "scales", "angles", "descriptors", "landmarks", "thumbnail")
-KEYFRAME_COLUMNS = (
-    *("id", "session", "frame_index", "stamp_ns", "file", "previous_id", "metric", "camera", "T_odom_cam"),
-    *("covariance", *_ARRAY_COLUMNS, "jpeg", "checksum"),
-)
-LOOP_COLUMNS = (
-    *("query_id", "match_id", "accepted", "reason", "inliers", "score", "votes", "jeffrey"),
-    *("T_match_query", "covariance", "scale", "checksum"),
-)
+Values = tuple[Any, ...]
+Row = Mapping[str, Any] | sqlite3.Row
+
+_DTYPES: Final = {"f4": np.float32, "f8": np.float64, "u1": np.uint8}
+NO_THUMBNAIL: Final = np.zeros((0, 0), np.uint8)
+NO_LANDMARKS: Final = np.zeros((0, 3), np.float32)
 
 
 def encode_array(array: NDArray[Any] | None) -> bytes | None:
@@ -38,68 +36,97 @@ def encode_array(array: NDArray[Any] | None) -> bytes | None:
 
 
 def decode_array(blob: bytes | None) -> NDArray[Any] | None:
-    """Return the read-only array of :func:`encode_array`."""
+    """Return the read-only array of :func:`encode_array`; raises MapCorruptError for anything else."""
     if blob is None:
         return None
-    header, _, data = blob.partition(b"\n")
-    code, *shape = header.decode().split()
-    return np.frombuffer(data, _DTYPES[code]).reshape([int(n) for n in shape])
+    try:
+        header, _, data = blob.partition(b"\n")
+        code, *shape = header.decode().split()
+        return np.frombuffer(data, _DTYPES[code]).reshape([int(n) for n in shape])
+    except (ValueError, KeyError, AttributeError) as error:
+        raise MapCorruptError(f"the map holds an array that is none: {error}") from error
 
 
-def encode_keyframe(keyframe: Keyframe) -> tuple[Any, ...]:
-    """Return the values of KEYFRAME_COLUMNS."""
-    features = keyframe.features
-    camera = None if keyframe.camera is None else json.dumps(asdict(keyframe.camera))
-    values = (
-        *(int(keyframe.id), int(keyframe.session), int(keyframe.index), int(keyframe.stamp_ns), keyframe.file),
-        None if keyframe.previous_id is None else int(keyframe.previous_id),
-        *(int(keyframe.metric), camera, encode_array(keyframe.T_odom_cam), encode_array(keyframe.covariance)),
-        *(encode_array(features.points), encode_array(features.scales), encode_array(features.angles)),
-        *(encode_array(features.descriptors), encode_array(keyframe.landmarks), encode_array(keyframe.thumbnail)),
-        keyframe.jpeg,
-    )
-    return (*values, checksum(values))
+def encode_keyframe(keyframe: Keyframe, T_previous_odom: NDArray[np.float64] | None) -> dict[str, Values]:
+    """Return the rows of keyframes, edges, features, landmarks and images; the keyframe's camera_id is left None.
+
+    ``T_previous_odom`` (4, 4) is the inverse of the previous keyframe's odometry pose.
+    """
+    features, number = keyframe.features, int(keyframe.id)
+    T_previous_cam = None
+    if T_previous_odom is not None and keyframe.T_odom_cam is not None:
+        T_previous_cam = T_previous_odom @ keyframe.T_odom_cam
+    previous_id = None if keyframe.previous_id is None else int(keyframe.previous_id)
+    return {
+        "keyframes": (
+            *(number, int(keyframe.session), int(keyframe.index), int(keyframe.stamp_ns), keyframe.file),
+            *(int(keyframe.metric), None, encode_array(keyframe.T_odom_cam)),
+        ),
+        "edges": (number, previous_id, encode_array(T_previous_cam), encode_array(keyframe.covariance)),
+        "features": (
+            *(number, encode_array(features.points), encode_array(features.scales)),
+            *(encode_array(features.angles), encode_array(features.descriptors)),
+        ),
+        "landmarks": (number, encode_array(keyframe.landmarks)),
+        "images": (number, keyframe.jpeg, encode_array(keyframe.thumbnail)),
+    }
 
 
-def decode_keyframe(row: sqlite3.Row) -> Keyframe:
-    """Return the keyframe of a row; raises MapCorruptError when the checksum differs."""
-    check_row(row, f"keyframe {row['id']}")
-    arrays = {name: decode_array(row[name]) for name in _ARRAY_COLUMNS}
-    camera = None
-    if row["camera"] is not None:
-        stored = json.loads(row["camera"])
-        camera = Camera(**{**stored, "distortion": tuple(stored["distortion"])})
+def encode_camera(camera: Camera) -> str:
+    """Return the camera as JSON."""
+    return json.dumps(asdict(camera))
+
+
+def decode_camera(text: str) -> Camera:
+    """Return the camera of :func:`encode_camera`."""
+    stored = json.loads(text)
+    return Camera(**{**stored, "distortion": tuple(stored["distortion"])})
+
+
+def decode_keyframe(
+    keyframe: Row,
+    edge: Row,
+    camera: Camera | None,
+    features: Row | None = None,
+    landmarks: Row | None = None,
+    images: Row | None = None,
+) -> Keyframe:
+    """Return the keyframe of its rows; what is None (not asked for, or pruned) is empty."""
     return Keyframe(
-        id=row["id"],
-        session=row["session"],
-        index=row["frame_index"],
-        stamp_ns=row["stamp_ns"],
-        file=row["file"],
-        features=Features(arrays["points"], arrays["scales"], arrays["angles"], arrays["descriptors"]),  # type: ignore[arg-type]
-        landmarks=arrays["landmarks"],  # type: ignore[arg-type]
-        thumbnail=arrays["thumbnail"],  # type: ignore[arg-type]
-        jpeg=row["jpeg"],
+        id=keyframe["id"],
+        session=keyframe["session"],
+        index=keyframe["frame_index"],
+        stamp_ns=keyframe["stamp_ns"],
+        file=keyframe["file"],
+        features=Features.empty() if features is None else decode_features(features),
+        landmarks=NO_LANDMARKS if landmarks is None else decode_array(landmarks["points"]),  # type: ignore[arg-type]
+        thumbnail=NO_THUMBNAIL if images is None else decode_array(images["thumbnail"]),  # type: ignore[arg-type]
+        jpeg=b"" if images is None else images["jpeg"],
         camera=camera,
-        previous_id=row["previous_id"],
-        T_odom_cam=decode_array(row["T_odom_cam"]),
-        covariance=decode_array(row["covariance"]),
-        metric=bool(row["metric"]),
+        previous_id=edge["previous_id"],
+        T_odom_cam=decode_array(keyframe["T_odom_cam"]),
+        covariance=decode_array(edge["covariance"]),
+        metric=bool(keyframe["metric"]),
     )
 
 
-def encode_loop(loop: Loop) -> tuple[Any, ...]:
-    """Return the values of LOOP_COLUMNS."""
-    values = (
+def decode_features(row: Row) -> Features:
+    """Return the features of a row of their table."""
+    arrays = [decode_array(row[name]) for name in ("points", "scales", "angles", "descriptors")]
+    return Features(*arrays)  # type: ignore[arg-type]
+
+
+def encode_loop(loop: Loop) -> Values:
+    """Return the row of a loop."""
+    return (
         *(int(loop.query_id), int(loop.match_id), int(loop.accepted), loop.reason.value, int(loop.inliers)),
         *(float(loop.score), float(loop.votes), float(loop.jeffrey)),
         *(encode_array(loop.T_match_query), encode_array(loop.covariance), float(loop.scale)),
     )
-    return (*values, checksum(values))
 
 
-def decode_loop(row: sqlite3.Row) -> Loop:
-    """Return the loop of a row; raises MapCorruptError when the checksum differs."""
-    check_row(row, f"loop {row['query_id']} to {row['match_id']}")
+def decode_loop(row: Row) -> Loop:
+    """Return the loop of a row."""
     return Loop(
         query_id=row["query_id"],
         match_id=row["match_id"],
@@ -115,22 +142,46 @@ def decode_loop(row: sqlite3.Row) -> Loop:
     )
 
 
-def checksum(values: tuple[Any, ...]) -> int:
-    """Return the CRC-32 of a row's values; names and lengths keep them apart."""
-    crc = 0
+def checksum(table: str, values: Sequence[Any]) -> int:
+    """Return the CRC-32 of a table's name and a row's values; names and lengths keep them apart.
+
+    The name is in it so that a row can be told without the tables around it, when a damaged file is searched for rows.
+    """
+    crc = zlib.crc32(table.encode())
     for value in values:
         if isinstance(value, float) and value != value:
             value = None  # SQLite stores a NaN as NULL
         data = value if isinstance(value, bytes) else repr(value).encode()
-        crc = zlib.crc32(f"{type(value).__name__} {len(data)}\n".encode() + data, crc)
+        crc = zlib.crc32(data, zlib.crc32(f"{type(value).__name__} {len(data)}\n".encode(), crc))
     return crc
 
 
-def check_row(row: sqlite3.Row, name: str) -> None:
+def sealed(table: str, values: Values) -> Values:
+    """Return a row as it is written: its values and their checksum."""
+    return (*values, checksum(table, values))
+
+
+def check_row(table: str, row: Sequence[Any] | sqlite3.Row) -> None:
     """Raise MapCorruptError unless the last column is the checksum of the others."""
     *values, expected = tuple(row)
-    if checksum(tuple(values)) != expected:
-        raise MapCorruptError(f"{name} of the map is damaged: its checksum differs")
+    if checksum(table, values) != expected:
+        raise MapCorruptError(f"{row_name(table, values)} of the map is damaged: its checksum differs")
+
+
+def row_name(table: str, values: Sequence[Any]) -> str:
+    """Return what a row is called in messages."""
+    if table in ("loops", "evidence"):
+        return f"{'loop' if table == 'loops' else 'the evidence of loop'} {values[0]} to {values[1]}"
+    if table == "keyframes":
+        return f"keyframe {values[0]}"
+    if table in ("edges", "features", "landmarks", "images", "poses"):
+        return f"row {table} of keyframe {values[0]}"
+    return f"row {values[0]} of {table}"
+
+
+def motion_between(T_odom_previous: NDArray[np.float64], T_odom_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``T_previous_cam`` of two odometry poses."""
+    return se3.inverse(T_odom_previous) @ T_odom_cam
 
 
 def _number(value: float | None) -> float:

@@ -1,54 +1,57 @@
 """The map on disk: one SQLite file that survives ``kill -9`` at any moment."""
 
-import fcntl
-import logging
-import os
 import sqlite3
-import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.errors import MapError, MapVersionError
+from seamark.backend.errors import MapCorruptError, MapError
 from seamark.backend.map_codec import (
-    KEYFRAME_COLUMNS,
-    LOOP_COLUMNS,
     check_row,
-    checksum,
     decode_array,
+    decode_camera,
     decode_keyframe,
     decode_loop,
     encode_array,
+    encode_camera,
     encode_keyframe,
     encode_loop,
+    sealed,
 )
-from seamark.backend.types import Loop, MapSnapshot
+from seamark.backend.map_file import MapFile
+from seamark.backend.map_schema import select, upsert
+from seamark.backend.types import Loop, MapSnapshot, Reason
+from seamark.frontend import se3
+from seamark.frontend.camera import Camera
 from seamark.frontend.types import Keyframe
 
-logger = logging.getLogger(__name__)
+FEATURES, IMAGES = "features", "images"
+BLOB_TABLES = ("images", "landmarks", "features")  # children first
+POSE_TOLERANCE = 1e-9
 
-APPLICATION_ID = 0x5EA3A12C
-SCHEMA_VERSION = 1
 
-_SCHEMA = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE keyframes (
-    id INTEGER PRIMARY KEY, session INTEGER NOT NULL, frame_index INTEGER NOT NULL, stamp_ns INTEGER NOT NULL,
-    file TEXT NOT NULL, previous_id INTEGER, metric INTEGER NOT NULL, camera TEXT, T_odom_cam BLOB, covariance BLOB,
-    points BLOB NOT NULL, scales BLOB NOT NULL, angles BLOB NOT NULL, descriptors BLOB NOT NULL,
-    landmarks BLOB NOT NULL, thumbnail BLOB NOT NULL, jpeg BLOB NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE poses (
-    keyframe_id INTEGER PRIMARY KEY REFERENCES keyframes (id), T_map_cam BLOB, component INTEGER NOT NULL,
-    scale REAL NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE loops (
-    query_id INTEGER NOT NULL, match_id INTEGER NOT NULL, accepted INTEGER NOT NULL, reason TEXT NOT NULL,
-    inliers INTEGER NOT NULL, score REAL, votes REAL, jeffrey REAL, T_match_query BLOB, covariance BLOB,
-    scale REAL NOT NULL, checksum INTEGER NOT NULL, PRIMARY KEY (query_id, match_id));
-"""
+@dataclass(frozen=True)
+class Verdict:
+    """One entry of a loop's history: what was thought of it when keyframe ``newest_keyframe_id`` was the newest."""
+
+    accepted: bool
+    reason: Reason
+    newest_keyframe_id: int
+    revision: int
+
+
+@dataclass(frozen=True)
+class Session:
+    """One session: where it begins, and the session in whose frame of reference its poses are."""
+
+    id: int
+    first_keyframe_id: int
+    stamp_ns: int
+    component: int
 
 
 class MapStore:
@@ -56,31 +59,15 @@ class MapStore:
 
     What a method has written is on disk when it returns (write-ahead log, full synchronisation); while the map is
     open, ``path-wal`` and ``path-shm`` belong to it, ``close`` makes it one file again. May be shared by threads.
-    Raises MapVersionError for a file that is no map or of another version, MapCorruptError for damage found by a
-    checksum, MapError for anything that the disk refuses.
+    What has been pruned of a keyframe is empty when it is read. Raises the errors of
+    :class:`~seamark.backend.map_file.MapFile`, and MapCorruptError for damage found by a checksum.
     """
 
     def __init__(self, path: Path, read_only: bool = False) -> None:
         self.path = path
-        self._lock = threading.RLock()
-        self._read_only = read_only
-        if read_only and not path.exists():
-            raise MapError(f"there is no map at {path}")
-        with self._translated("opened"):
-            mode = "ro" if read_only else "rwc"
-            self._database = sqlite3.connect(
-                f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, check_same_thread=False
-            )
-            self._database.row_factory = sqlite3.Row
-        self._claim: int | None = None
-        try:
-            with self._translated("opened"):
-                self._open()
-            if not read_only:
-                self._claim = _claim(path)
-        except BaseException:
-            self._database.close()
-            raise
+        self.file = MapFile(path, read_only)
+        self._cameras: dict[int, Camera] = {}
+        self._written: dict[int, tuple[NDArray[np.float64], float]] = {}  # poses as they are in the file
 
     def __enter__(self) -> "MapStore":
         return self
@@ -90,163 +77,229 @@ class MapStore:
 
     def set_meta(self, values: Mapping[str, str]) -> None:
         """Write facts about the whole map: mode, vocabulary hash, config hash, version that created it, revision."""
-        with self._translated("written"), self._transaction():
-            self._database.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+        self.record(meta=values)
 
     def meta(self) -> dict[str, str]:
         """Return the facts about the whole map."""
-        with self._translated("read"):
-            return {row["key"]: row["value"] for row in self._database.execute("SELECT * FROM meta ORDER BY key")}
+        return {row["key"]: row["value"] for row in self._rows("meta")}
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Write a keyframe; it is safe on disk when this returns. One that is there already is replaced."""
-        with self._translated("written"), self._transaction():
-            self._database.execute(_insert("keyframes", KEYFRAME_COLUMNS), encode_keyframe(keyframe))
+        """Write a keyframe; it is safe on disk when this returns. One that is there already is replaced.
+
+        Raises MapError when its predecessor is not in the map.
+        """
+        with self.file.writing() as database:
+            T_previous_odom = None
+            if keyframe.previous_id is not None:
+                T_odom_previous = self._odometry_of(database, int(keyframe.previous_id), keyframe)
+                T_previous_odom = None if T_odom_previous is None else se3.inverse(T_odom_previous)
+            rows = encode_keyframe(keyframe, T_previous_odom)
+            session = (int(keyframe.session), int(keyframe.id), int(keyframe.stamp_ns), int(keyframe.session))
+            statement = upsert("sessions").partition(" DO UPDATE")[0] + " DO NOTHING"
+            database.execute(statement, sealed("sessions", session))
+            if keyframe.camera is not None:
+                *before, _, T_odom_cam = rows["keyframes"]
+                rows["keyframes"] = (*before, self._camera_id(database, keyframe.camera), T_odom_cam)
+            for table, values in rows.items():
+                database.execute(upsert(table), sealed(table, values))
+
+    def record(
+        self, loops: Iterable[Loop] = (), snapshot: MapSnapshot | None = None, meta: Mapping[str, str] | None = None
+    ) -> None:
+        """Write in one transaction: loops (replacing earlier verdicts on the same pairs), poses, and facts."""
+        written: dict[int, tuple[NDArray[np.float64], float]] = {}
+        with self.file.writing() as database:
+            self._write_loops(database, loops)
+            facts = dict(meta or {})
+            if snapshot is not None:
+                written = self._write_poses(database, snapshot)
+                facts["revision"] = str(snapshot.revision)
+            database.executemany(upsert("meta"), [sealed("meta", pair) for pair in facts.items()])
+        self._written |= written
 
     def add_loop(self, loop: Loop) -> None:
         """Write a loop's row, replacing the earlier verdict on the same pair."""
-        self.add_loops([loop])
+        self.record([loop])
 
     def add_loops(self, loops: Iterable[Loop]) -> None:
         """Write loops' rows in one transaction, replacing earlier verdicts on the same pairs."""
-        with self._translated("written"), self._transaction():
-            self._database.executemany(_insert("loops", LOOP_COLUMNS), map(encode_loop, loops))
+        self.record(loops)
+
+    def add_evidence(self, query_id: int, match_id: int, content: bytes) -> None:
+        """Write what a loop rests on; the loop must be there. The content's form is the caller's."""
+        with self.file.writing() as database:
+            database.execute(upsert("evidence"), sealed("evidence", (int(query_id), int(match_id), content)))
+
+    def evidence(self, query_id: int, match_id: int) -> bytes | None:
+        """Return what a loop rests on, None when nothing was kept."""
+        rows = self._rows("evidence", "query_id = ? AND match_id = ?", (int(query_id), int(match_id)))
+        return rows[0]["content"] if rows else None
+
+    def history(self, query_id: int, match_id: int) -> tuple[Verdict, ...]:
+        """Return all verdicts on a loop, the oldest first."""
+        rows = self._rows("history", "query_id = ? AND match_id = ?", (int(query_id), int(match_id)))
+        return tuple(
+            Verdict(bool(row["accepted"]), Reason(row["reason"]), row["newest_keyframe_id"], row["revision"])
+            for row in rows
+        )
 
     def update_poses(self, snapshot: MapSnapshot) -> None:
         """Write all poses and the revision of a snapshot in one transaction."""
-        rows = []
-        columns = (snapshot.keyframe_ids, snapshot.T_map_cam, snapshot.components, snapshot.scales)
-        for keyframe_id, T_map_cam, component, scale in zip(*columns, strict=True):
-            pose = encode_array(T_map_cam) if np.isfinite(T_map_cam).all() else None
-            values = (int(keyframe_id), pose, int(component), float(scale))
-            rows.append((*values, checksum(values)))
-        with self._translated("written"), self._transaction():
-            self._database.executemany("INSERT OR REPLACE INTO poses VALUES (?, ?, ?, ?, ?)", rows)
-            self._database.execute("INSERT OR REPLACE INTO meta VALUES ('revision', ?)", (str(snapshot.revision),))
+        self.record(snapshot=snapshot)
+
+    def update_landmarks(self, landmarks: Mapping[int, NDArray[np.float32]]) -> None:
+        """Replace the landmarks (N, 3) of keyframes that have features, in one transaction."""
+        rows = [(int(number), encode_array(points)) for number, points in landmarks.items()]
+        with self.file.writing() as database:
+            database.executemany(upsert("landmarks"), [sealed("landmarks", row) for row in rows])
+
+    def forget(self, keyframe_ids: Iterable[int]) -> None:
+        """Delete features, landmarks and images of keyframes; their poses, edges and loops stay."""
+        ids = [(int(number),) for number in keyframe_ids]
+        with self.file.writing() as database:
+            for table in BLOB_TABLES:
+                database.executemany(f"DELETE FROM {table} WHERE keyframe_id = ?", ids)
+
+    def keyframe_ids(self, recognisable: bool = False) -> list[int]:
+        """Return the ids of all keyframes, or of those that have features, ascending."""
+        table, column = ("features", "keyframe_id") if recognisable else ("keyframes", "id")
+        with self.file.reading() as database:
+            return [row[0] for row in database.execute(f"SELECT {column} FROM {table} ORDER BY 1")]
 
     def load_keyframes(self) -> Iterator[Keyframe]:
         """Yield all keyframes by ascending id, read one at a time."""
-        with self._translated("read"):
-            ids = [row["id"] for row in self._database.execute("SELECT id FROM keyframes ORDER BY id")]
-        for keyframe_id in ids:
+        for keyframe_id in self.keyframe_ids():
             yield self.keyframe(keyframe_id)
 
-    def keyframe(self, keyframe_id: int) -> Keyframe:
-        """Return one keyframe; raises MapError when there is none of this id."""
-        with self._translated("read"):
-            columns = ", ".join(KEYFRAME_COLUMNS)
-            row = self._database.execute(f"SELECT {columns} FROM keyframes WHERE id = ?", (keyframe_id,)).fetchone()
-        if row is None:
+    def load_nodes(self) -> list[Keyframe]:
+        """Return all keyframes by ascending id without features, landmarks and images."""
+        keyframes, edges = self._rows("keyframes"), {row["keyframe_id"]: row for row in self._rows("edges")}
+        return [
+            decode_keyframe(row, _edge(edges.get(row["id"]), row["id"]), self._camera(row["camera_id"]))
+            for row in keyframes
+        ]
+
+    def keyframe(self, keyframe_id: int, parts: tuple[str, ...] = (FEATURES, IMAGES)) -> Keyframe:
+        """Return one keyframe with these parts of it; raises MapError when there is none of this id."""
+        number = (int(keyframe_id),)
+        rows = self._rows("keyframes", "id = ?", number)
+        if not rows:
             raise MapError(f"{self.path} has no keyframe {keyframe_id}")
-        return decode_keyframe(row)
+        tables = ("edges",) + ("features", "landmarks") * (FEATURES in parts) + ("images",) * (IMAGES in parts)
+        found = {table: next(iter(self._rows(table, "keyframe_id = ?", number)), None) for table in tables}
+        edge, camera = _edge(found.pop("edges"), keyframe_id), self._camera(rows[0]["camera_id"])
+        return decode_keyframe(rows[0], edge, camera, **found)
 
     def load_loops(self) -> tuple[Loop, ...]:
         """Return all loops' rows in the order of their pairs."""
-        with self._translated("read"):
-            columns = ", ".join(LOOP_COLUMNS)
-            rows = self._database.execute(f"SELECT {columns} FROM loops ORDER BY query_id, match_id").fetchall()
-        return tuple(decode_loop(row) for row in rows)
+        return tuple(decode_loop(row) for row in self._rows("loops"))
+
+    def load_sessions(self) -> tuple[Session, ...]:
+        """Return all sessions by ascending id."""
+        return tuple(Session(*tuple(row)[:-1]) for row in self._rows("sessions"))
 
     def load_poses(self) -> dict[int, tuple[NDArray[Any] | None, int, float]]:
         """Return for each keyframe that has been in a snapshot its T_map_cam (or None), component and scale."""
-        with self._translated("read"):
-            rows = self._database.execute("SELECT * FROM poses ORDER BY keyframe_id").fetchall()
-        poses = {}
-        for row in rows:
-            check_row(row, f"pose of keyframe {row['keyframe_id']}")
-            poses[row["keyframe_id"]] = (decode_array(row["T_map_cam"]), row["component"], row["scale"])
-        return poses
+        components = {session.id: session.component for session in self.load_sessions()}
+        sessions = self.session_of_keyframes()
+        return {
+            row["keyframe_id"]: (
+                decode_array(row["T_map_cam"]),
+                components.get(sessions[row["keyframe_id"]], sessions[row["keyframe_id"]]),
+                row["scale"],
+            )
+            for row in self._rows("poses")
+        }
+
+    def session_of_keyframes(self) -> dict[int, int]:
+        """Return the session of each keyframe."""
+        with self.file.reading() as database:
+            return dict(map(tuple, database.execute("SELECT id, session FROM keyframes")))
+
+    def bytes_used(self) -> int:
+        """Return how many bytes of the file hold something: free pages are used again before it grows."""
+        with self.file.reading() as database:
+            names = ("page_count", "freelist_count", "page_size")
+            count, free, size = (database.execute(f"PRAGMA {name}").fetchone()[0] for name in names)
+        return int((count - free) * size)
 
     def export_single_file(self) -> None:
         """Move the write-ahead log into the file, so that ``path`` alone is the whole map."""
-        if not self._read_only:
-            with self._translated("written"):
-                self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        self.file.checkpoint()
 
     def close(self) -> None:
         """Make the map one file and close it; harmless when repeated."""
-        try:
-            self.export_single_file()
-        except MapError as error:
-            if not isinstance(error.__cause__, sqlite3.ProgrammingError):  # closed before
-                raise
-        finally:
-            self._database.close()
-            if self._claim is not None:  # after the database: closing any descriptor of a file drops SQLite's own locks
-                os.close(self._claim)
-                self._claim = None
+        self.file.close()
 
-    def _open(self) -> None:
-        """Create the tables, or check that they are ours."""
-        application_id = self._database.execute("PRAGMA application_id").fetchone()[0]
-        version = self._database.execute("PRAGMA user_version").fetchone()[0]
-        tables = self._database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-        if (application_id, version, tables) == (0, 0, 0) and not self._read_only:
-            self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = FULL")
-            with self._transaction():
-                for statement in filter(str.strip, _SCHEMA.split(";")):
-                    self._database.execute(statement)
-                self._database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            _sync_folder(self.path.absolute().parent)
-            return
-        if application_id != APPLICATION_ID:
-            raise MapVersionError(f"{self.path} is no map of Seamark")
-        if version != SCHEMA_VERSION:
-            raise MapVersionError(f"{self.path} has map version {version}; this program knows {SCHEMA_VERSION}")
-        if not self._read_only:
-            self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = FULL")
+    def _rows(self, table: str, condition: str = "", values: tuple[Any, ...] = ()) -> list[sqlite3.Row]:
+        with self.file.reading() as database:
+            rows = database.execute(select(table, condition), values).fetchall()
+        for row in rows:
+            check_row(table, row)
+        return rows
 
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        self._database.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self._database.execute("COMMIT")
-        except BaseException:
-            if self._database.in_transaction:
-                self._database.execute("ROLLBACK")
-            raise
+    def _odometry_of(
+        self, database: sqlite3.Connection, previous_id: int, keyframe: Keyframe
+    ) -> NDArray[np.float64] | None:
+        row = database.execute("SELECT T_odom_cam FROM keyframes WHERE id = ?", (previous_id,)).fetchone()
+        if row is None:
+            raise MapError(f"keyframe {keyframe.id} follows {previous_id}, which is not in the map")
+        return decode_array(row["T_odom_cam"])
 
-    @contextmanager
-    def _translated(self, verb: str) -> Iterator[None]:
-        """Turn SQLite's errors into ours."""
-        try:
-            with self._lock:
-                yield
-        except sqlite3.Error as error:
-            if getattr(error, "sqlite_errorname", "") == "SQLITE_NOTADB":
-                raise MapVersionError(f"{self.path} is no map of Seamark") from error
-            raise MapError(f"the map {self.path} cannot be {verb}: {error}") from error
+    def _camera(self, camera_id: int | None) -> Camera | None:
+        if camera_id is not None and camera_id not in self._cameras:
+            self._cameras |= {row["id"]: decode_camera(row["model"]) for row in self._rows("cameras")}
+        return None if camera_id is None else self._cameras[camera_id]
 
+    def _camera_id(self, database: sqlite3.Connection, camera: Camera) -> int:
+        model = encode_camera(camera)
+        row = database.execute("SELECT id FROM cameras WHERE model = ?", (model,)).fetchone()
+        if row is not None:
+            return int(row["id"])
+        number = int(database.execute("SELECT coalesce(max(id) + 1, 0) FROM cameras").fetchone()[0])
+        database.execute(upsert("cameras"), sealed("cameras", (number, model)))
+        return number
 
-def _insert(table: str, columns: tuple[str, ...]) -> str:
-    marks = ", ".join("?" * len(columns))
-    return f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}) VALUES ({marks})"
+    def _write_loops(self, database: sqlite3.Connection, loops: Iterable[Loop]) -> None:
+        for loop in loops:
+            key = (int(loop.query_id), int(loop.match_id))
+            condition = "SELECT accepted, reason FROM loops WHERE query_id = ? AND match_id = ?"
+            before = database.execute(condition, key).fetchone()
+            database.execute(upsert("loops"), sealed("loops", encode_loop(loop)))
+            verdict = (int(loop.accepted), loop.reason.value)
+            if before is None or tuple(before) != verdict:
+                count, newest, revision = database.execute(
+                    "SELECT (SELECT coalesce(max(id), 0) FROM history), (SELECT max(id) FROM keyframes),"
+                    " coalesce((SELECT value FROM meta WHERE key = 'revision'), 0)"
+                ).fetchone()
+                entry = (count + 1, *key, *verdict, newest, int(revision))
+                database.execute(upsert("history"), sealed("history", entry))
 
-
-def _claim(path: Path) -> int:
-    """Return a descriptor that keeps other writers from the map until it is closed, by whatever end of the process.
-
-    Two services would number their keyframes alike and overwrite one another's.
-    """
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(descriptor)
-        raise MapError(f"the map {path} is in use by another process") from error
-    except OSError:  # a file system without locks
-        logger.warning("the map %s cannot be locked: keep other services from it", path)
-    return descriptor
+    def _write_poses(
+        self, database: sqlite3.Connection, snapshot: MapSnapshot
+    ) -> dict[int, tuple[NDArray[np.float64], float]]:
+        """Write the poses that have moved, and the components of their sessions; return what was written."""
+        written = {}
+        rows = []
+        columns = (snapshot.keyframe_ids.tolist(), snapshot.T_map_cam, snapshot.scales.tolist())
+        for number, T_map_cam, scale in zip(*columns, strict=True):
+            before = self._written.get(number)
+            if before is not None and before[1] == scale and not np.abs(before[0] - T_map_cam).max() > POSE_TOLERANCE:
+                continue
+            written[number] = (T_map_cam, scale)
+            pose = encode_array(T_map_cam) if np.isfinite(T_map_cam).all() else None
+            rows.append(sealed("poses", (number, pose, float(scale))))
+        database.executemany(upsert("poses"), rows)
+        wanted = dict(zip(snapshot.sessions.tolist(), snapshot.components.tolist(), strict=True))
+        for row in database.execute(select("sessions")).fetchall():
+            session = Session(*tuple(row)[:-1])
+            if wanted.get(session.id, session.component) != session.component:
+                values = (session.id, session.first_keyframe_id, session.stamp_ns, wanted[session.id])
+                database.execute(upsert("sessions"), sealed("sessions", values))
+        return written
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make the entry of a new file durable: SQLite does it for its journals only."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _edge(row: sqlite3.Row | None, keyframe_id: int) -> sqlite3.Row:
+    if row is None:
+        raise MapCorruptError(f"the edge of keyframe {keyframe_id} is missing")
+    return row

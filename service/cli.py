@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from seamark import SeamarkError, __version__
+from seamark.service.map_commands import map_app
 from seamark.service.places_commands import places_app
 from seamark.service.terminal import Bar, errors, print_json, print_table
 
@@ -32,6 +33,7 @@ app.add_typer(vocab_app, name="vocab")
 app.add_typer(config_app, name="config")
 app.add_typer(synth_app, name="synth")
 app.add_typer(places_app, name="places")
+app.add_typer(map_app, name="map")
 
 Sources = Annotated[list[str], typer.Argument(help="Folders, videos or synth:NAME, taken one after another.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]

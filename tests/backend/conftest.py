@@ -137,3 +137,25 @@ def ideal() -> Camera:
 @pytest.fixture
 def distorted() -> Camera:
     return DISTORTED
+
+
+@pytest.fixture(scope="session")
+def make_keyframe() -> Callable[[int], Keyframe]:
+    """Return a maker of keyframes whose every field is something, by their number."""
+
+    def make(number: int) -> Keyframe:
+        w = make_world(number, 200)
+        return w.view(
+            np.eye(4),
+            DISTORTED,
+            id=number,
+            session=1,
+            index=3 * number,
+            stamp_ns=1403715273262142976 + number,
+            file=f"cam0/{number}.png",
+            previous_id=number - 1 if number else None,
+            T_odom_cam=np.linalg.qr(w.rng.normal(size=(4, 4)))[0],
+            covariance=np.diag(w.rng.random(6)),
+        )
+
+    return make

@@ -1,0 +1,65 @@
+"""The commands `seamark map ...`: what is in a map file, whether it is whole, and what to do if it is not."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from seamark.service.terminal import Bar, print_json, print_table
+
+# Everything else is imported in the command that needs it: --help must not wait for OpenCV.
+
+EXIT_DAMAGED = 3
+
+map_app = typer.Typer(no_args_is_help=True, help="Map files: look at them, check, repair, export and prune them.")
+
+MapArgument = Annotated[Path, typer.Argument(help="The map file.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+@map_app.command("info")
+def info_command(map_file: MapArgument, as_json: JsonOption = False) -> None:
+    """Print what is in a map: sessions, keyframes, loops, sizes. A service may be writing it meanwhile."""
+    from seamark.backend.map_info import describe_map
+    from seamark.service import map_report
+
+    info = describe_map(map_file)
+    if as_json:
+        print_json(asdict(info))
+        return
+    for table in map_report.info_tables(map_file, info):
+        print_table(table)
+
+
+@map_app.command("check")
+def check_command(map_file: MapArgument, as_json: JsonOption = False) -> None:
+    """Read all of a map and verify every checksum and reference. Exit code 3: it is damaged."""
+    from seamark.backend.map_check import check_map
+    from seamark.service import map_report
+
+    with Bar("checking") as bar:
+        report = check_map(map_file, bar.count)
+    if as_json:
+        print_json({"whole": not report.problems, **asdict(report)})
+    else:
+        print_table(map_report.check_table(map_file, report))
+    if report.problems:
+        raise typer.Exit(EXIT_DAMAGED)
+
+
+@map_app.command("repair")
+def repair_command(
+    map_file: MapArgument,
+    out: Annotated[Path, typer.Option("--out", help="The new map file to write.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Save all that is whole in a damaged map (or one of an earlier version) to a new file, and say what is lost."""
+    from seamark.backend.map_repair import repair_map
+    from seamark.service import map_report
+
+    report = repair_map(map_file, out)
+    if as_json:
+        print_json({"out": str(out), **asdict(report)})
+    else:
+        print_table(map_report.repair_table(out, report))
