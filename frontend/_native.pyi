@@ -6,16 +6,36 @@ from numpy.typing import NDArray
 _Camera: TypeAlias = tuple[float, float, float, float]
 _Aligned: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
 
+def levels() -> list[str]: ...
+
+class Pyramid:
+    def __init__(self, grey: NDArray[np.uint8], levels: int) -> None: ...
+    @property
+    def top(self) -> int: ...
+    @property
+    def grey(self) -> NDArray[np.uint8]: ...
+    def level(self, level: int) -> NDArray[np.uint8]: ...
+
+def follow(
+    before: Pyramid,
+    after: Pyramid,
+    points: NDArray[np.float32],
+    start: NDArray[np.float32],
+    side: int,
+    top: int,
+    back_top: int,
+    level: str | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 def align_along(
-    source: NDArray[np.uint8],
-    target: NDArray[np.uint8],
+    source: Pyramid,
+    target: Pyramid,
     points: NDArray[np.float32],
     start: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> _Aligned: ...
 def align_warped(
-    source: NDArray[np.uint8],
-    target: NDArray[np.uint8],
+    source: Pyramid,
+    target: Pyramid,
     points: NDArray[np.float32],
     start: NDArray[np.float32],
     unwarp: NDArray[np.float32],

@@ -19,9 +19,12 @@ class FrontendConfig(BaseModel):
     motion_masks: bool = Field(True, description="say what moves while the camera stands still")
     max_corners: int = Field(420, ge=50, le=5000, description="tracked corners per image, spread by grid")
     min_corner_response: float = Field(2e-5, gt=0, description="floor of the Shi-Tomasi response (image in 0..1)")
-    flow_window_px: int = Field(21, ge=5, le=51, description="side of the Lucas-Kanade patch")
+    flow_window_px: int = Field(21, ge=5, le=29, description="side of the Lucas-Kanade patch; odd, else one more")
     flow_levels: int = Field(4, ge=0, le=8, description="highest level of the Lucas-Kanade pyramid")
     flow_round_trip_px: float = Field(0.8, gt=0, description="forward-backward distance that a good track stays under")
+    flow_min_correlation: float = Field(
+        0.5, ge=-1, le=1, description="zero-mean normalised correlation of a good track's patch with the one before"
+    )
 
     # Motion
     pnp_threshold_px: float = Field(2.5, gt=0, description="reprojection error of a RANSAC inlier")

@@ -13,8 +13,10 @@ from seamark.frontend import flow, se3
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import grey_of
 from seamark.frontend.patches import align_along
+from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.types import Frame, Mode, Rig
 
+WINDOW_PX, LEVELS = 21, 4  # of the flow across a pair, whatever that between frames is
 EPIPOLAR_PX = 1.5
 MAX_REFINEMENT_PX = 2.5
 MIN_CORRELATION = 0.8
@@ -108,7 +110,7 @@ class StereoPair:
         unknown = np.full(len(points), np.nan)
         if frame.image_right is None or len(points) == 0:
             return unknown, unknown.copy()
-        left, right = grey_of(frame.image), grey_of(frame.image_right)
+        left, right = (pyramid_of(grey_of(image), LEVELS) for image in (frame.image, frame.image_right))
         c = self._config
         there, ok = self._match(left, right, np.asarray(points, np.float32))
         inverse, distance = self._triangulate(points, there)
@@ -125,20 +127,26 @@ class StereoPair:
         return np.where(ok, inverse, np.nan), np.where(ok, sigma, np.nan)
 
     def _match(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8], points: NDArray[np.float32]
+        self, left: Pyramid, right: Pyramid, points: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Match along coarse-to-fine flow, from infinity and, where that fails, from a close guess."""
         rays = self._left.rays(points)
         guesses = [
             self._right.project(se3.transform(self._T_right_left, rays * z)) for z in (1e6, 25 * self._baseline_m)
         ]
-        settings = {"window_px": 21, "levels": 4, "round_trip_px": self._config.flow_round_trip_px}
-        there, ok = flow.track(left, right, points, guesses[0].astype(np.float32), **settings)  # type: ignore[arg-type]
-        if not ok.all():
-            again, ok_again = flow.track(left, right, points[~ok], guesses[1][~ok].astype(np.float32), **settings)  # type: ignore[arg-type]
-            there[~ok] = again
-            ok = ok.copy()
-            ok[~ok] = ok_again
+        there, ok = np.zeros((len(points), 2), np.float32), np.zeros(len(points), bool)
+        for guess in guesses:
+            todo = np.flatnonzero(~ok)
+            there[todo], ok[todo] = flow.track(
+                left,
+                right,
+                points[todo],
+                guess[todo].astype(np.float32),
+                window_px=WINDOW_PX,
+                levels=LEVELS,
+                round_trip_px=self._config.flow_round_trip_px,
+                min_correlation=self._config.flow_min_correlation,
+            )
         return there, ok
 
     def _epipolar_curve(

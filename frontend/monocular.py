@@ -11,6 +11,7 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import grey_of
 from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.pose import estimate_pose, motion_covariance
+from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import TwoView, initialise
@@ -99,7 +100,7 @@ def insert_first_keyframes(
     session: Session,
     initialiser: MonoInitialiser,
     frame: Frame,
-    grey: NDArray[np.uint8],
+    image: Pyramid,
     two_view: TwoView,
     ids: NDArray[np.int64],
     builder: KeyframeBuilder,
@@ -110,13 +111,14 @@ def insert_first_keyframes(
     a = builder.request(initialiser.first, session.id, None, T_odom_first, None)
     session.tracks = first.tracks[np.isin(first.tracks.ids, live.ids)]
     unknown = np.full(len(session.tracks), np.nan)
-    session.insert_keyframe(a.id, first.stamp_ns, grey_of(initialiser.first.image), T_odom_first, unknown, unknown)
+    first_image = pyramid_of(grey_of(initialiser.first.image), session.config.flow_levels)
+    session.insert_keyframe(a.id, first.stamp_ns, first_image, T_odom_first, unknown, unknown)
 
     session.tracks = live
-    session.add_corners(grey, frame.mask)
+    session.add_corners(image.grey, frame.mask)
     unknown = np.full(len(session.tracks), np.nan)
     session.insert_keyframe(
-        builder.next_id, frame.stamp_ns, grey, T_odom_first @ two_view.T_first_second, unknown, unknown
+        builder.next_id, frame.stamp_ns, image, T_odom_first @ two_view.T_first_second, unknown, unknown
     )
     session.velocity = np.eye(4)
     session.last_pose_stamp_ns = frame.stamp_ns

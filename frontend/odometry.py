@@ -20,6 +20,7 @@ from seamark.frontend.masks import allowed, combined, read_mask
 from seamark.frontend.monocular import MonoInitialiser, insert_first_keyframes
 from seamark.frontend.motion_mask import MotionMasks
 from seamark.frontend.pose import PoseEstimate, motion_covariance
+from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.recovery import recover
 from seamark.frontend.session import Session
 from seamark.frontend.tracks import TrackAges, Tracks
@@ -70,7 +71,7 @@ class Frontend:
         self._builder = KeyframeBuilder(rig, mode, config, self._sensor)
         self._session: Session | None = None
         self._initialiser: MonoInitialiser | None = None
-        self._grey: NDArray[np.uint8] | None = None
+        self._image: Pyramid | None = None
         self._stamps = StampGate(mode, config)
         camera = rig.cam0 if rig is not None and mode is not Mode.PLACES else None
         self._mask = read_mask(config.mask_file, camera) if config.mask_file is not None else None
@@ -112,23 +113,23 @@ class Frontend:
     def _follow(self, frame: Frame) -> Odometry:
         """Say where the camera of one frame is."""
         watch = Stopwatch(self._clock)
-        grey = grey_of(frame.image)
-        session, before, self._grey = self._session, self._grey, grey
+        image = pyramid_of(grey_of(frame.image), self._config.flow_levels)
+        session, before, self._image = self._session, self._image, image
         if session is None or before is None:
-            return self._start(frame, grey)
+            return self._start(frame, image)
 
-        tracks, was = tracker.follow(session, before, grey, predict=self._initialiser is None)
+        tracks, was = tracker.follow(session, before, image, predict=self._initialiser is None)
         usable = allowed(frame.mask, tracks.pixels)
         tracks, was = tracks[usable], was[usable]
         watch.lap("track")
         if self._initialiser is not None:
-            return self._initialise(session, self._initialiser, frame, grey, tracks)
+            return self._initialise(session, self._initialiser, frame, image, tracks)
 
         pose, keep = tracker.estimate(session, self._sensor, frame, tracks)
         watch.lap("pose")
         if pose is None:
-            return self._recover(session, frame, grey)
-        settled = tracker.settle(session, grey, tracks, pose.T_odom_cam)
+            return self._recover(session, frame, image)
+        settled = tracker.settle(session, image, tracks, pose.T_odom_cam)
         better, keep_better = tracker.estimate(session, self._sensor, frame, settled)
         if better is not None:
             pose, keep, tracks = better, keep_better, settled
@@ -136,17 +137,19 @@ class Frontend:
 
         session.move(frame.stamp_ns, pose.T_odom_cam, tracks[keep])
         ages = self._ages.step(session.id, session.tracks.ids)
-        moving = self._motion.step(grey, frame.stamp_ns, pose.T_odom_cam, session.distance()) if self._motion else None
+        moving = (
+            self._motion.step(image.grey, frame.stamp_ns, pose.T_odom_cam, session.distance()) if self._motion else None
+        )
         keyframe_id = None
         if tracker.keyframe_due(session, frame.stamp_ns, int(pose.inliers.sum())):
-            keyframe_id = self._insert_keyframe(session, frame, grey, pose.covariance)
+            keyframe_id = self._insert_keyframe(session, frame, image, pose.covariance)
             watch.lap("keyframe")
         arrows = np.hstack([tracks.pixels, was])[keep]
         odometry = self._tracked(session, frame, pose, Outcome.TRACKED, keyframe_id, arrows, watch.stages_ms)
         return replace(odometry, track_ages=ages, motion_mask=moving)
 
     def _insert_keyframe(
-        self, session: Session, frame: Frame, grey: NDArray[np.uint8], covariance: NDArray[np.float64] | None
+        self, session: Session, frame: Frame, image: Pyramid, covariance: NDArray[np.float64] | None
     ) -> int | None:
         """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way.
 
@@ -154,10 +157,10 @@ class Frontend:
         """
         previous = session.mapped
         keyframe_id = self._builder.next_id if tracker.map_keyframe_due(session, frame.stamp_ns) else None
-        session.revisit(grey)
-        session.add_corners(grey, frame.mask)
+        session.revisit(image)
+        session.add_corners(image.grey, frame.mask)
         depths = self._sensor.inverse_depth(frame, session.tracks.pixels)
-        session.insert_keyframe(keyframe_id, frame.stamp_ns, grey, session.T_odom_cam, *depths)
+        session.insert_keyframe(keyframe_id, frame.stamp_ns, image, session.T_odom_cam, *depths)
         if keyframe_id is None:
             return None
         motion = None
@@ -169,26 +172,26 @@ class Frontend:
         self._builder.submit([request])
         return request.id
 
-    def _start(self, frame: Frame, grey: NDArray[np.uint8]) -> Odometry:
+    def _start(self, frame: Frame, image: Pyramid) -> Odometry:
         """Begin a session where there is enough to see; its odometry goes on from where the last one ended."""
         assert self._rig is not None
         mono = self._mode is Mode.MONO
         session = Session(
             self._next_session, self._config, self._rig.cam0, not mono, self._T_odom_start, self._depth_offset
         )
-        session.add_corners(grey, frame.mask)
+        session.add_corners(image.grey, frame.mask)
         inverse, _ = self._sensor.inverse_depth(frame, session.tracks.pixels)
         usable = len(session.tracks) if mono else int(np.isfinite(inverse).sum())
         if usable < MIN_CORNERS:
             self._session = None
-            return report(frame, Outcome.LOST, Quality.LOST, loss=loss_of(grey, self._config.min_corner_response))
+            return report(frame, Outcome.LOST, Quality.LOST, loss=loss_of(image.grey, self._config.min_corner_response))
         self._session = session
         self._motion = MotionMasks(self._rig.cam0.fx) if self._config.motion_masks else None
         session.last_pose_stamp_ns = frame.stamp_ns
         self._next_session += 1
         if mono:
             return self._begin_initialising(session, frame)
-        keyframe_id = self._insert_keyframe(session, frame, grey, None)
+        keyframe_id = self._insert_keyframe(session, frame, image, None)
         return report(
             frame,
             Outcome.NEW_SESSION,
@@ -207,7 +210,7 @@ class Frontend:
         return report(frame, Outcome.INITIALISING, Quality.LOST, session=session.id)
 
     def _initialise(
-        self, session: Session, initialiser: MonoInitialiser, frame: Frame, grey: NDArray[np.uint8], tracks: Tracks
+        self, session: Session, initialiser: MonoInitialiser, frame: Frame, image: Pyramid, tracks: Tracks
     ) -> Odometry:
         """Wait for enough parallax, then make the first two mono keyframes and fill in the frames between."""
         session.tracks = tracks
@@ -217,12 +220,12 @@ class Frontend:
             if not initialiser.exhausted:
                 return report(frame, Outcome.INITIALISING, Quality.LOST, session=session.id)
             session.tracks = Tracks.none()
-            session.add_corners(grey, frame.mask)
+            session.add_corners(image.grey, frame.mask)
             return self._begin_initialising(session, frame)
 
         two_view, ids = result
         self._initialiser = None
-        filled = insert_first_keyframes(session, initialiser, frame, grey, two_view, ids, self._builder)
+        filled = insert_first_keyframes(session, initialiser, frame, image, two_view, ids, self._builder)
         return report(
             frame,
             Outcome.TRACKED,
@@ -236,7 +239,7 @@ class Frontend:
             filled=filled,
         )
 
-    def _recover(self, session: Session, frame: Frame, grey: NDArray[np.uint8]) -> Odometry:
+    def _recover(self, session: Session, frame: Frame, image: Pyramid) -> Odometry:
         """Flow has failed: descriptors against recent keyframes, else lost, after a while a new session."""
         found = recover(frame, self._builder.recent(session.id), session.camera, self._config, session.prediction())
         session.tracks = Tracks.none()
@@ -245,7 +248,7 @@ class Frontend:
             session.landmarks.set(fresh.ids, found.landmarks, found.spread)
             session.move(frame.stamp_ns, found.estimate.T_odom_cam, session.tracks)
             session.velocity = np.eye(4)
-            keyframe_id = self._insert_keyframe(session, frame, grey, found.estimate.covariance)
+            keyframe_id = self._insert_keyframe(session, frame, image, found.estimate.covariance)
             arrows = np.hstack([found.pixels, found.pixels])
             return self._tracked(session, frame, found.estimate, Outcome.RECOVERED, keyframe_id, arrows, {})
         session.velocity = np.eye(4)
@@ -255,10 +258,10 @@ class Frontend:
                 Outcome.LOST,
                 Quality.LOST,
                 session=session.id,
-                loss=loss_of(grey, self._config.min_corner_response),
+                loss=loss_of(image.grey, self._config.min_corner_response),
             )
         self._end_session()
-        return self._start(frame, grey)
+        return self._start(frame, image)
 
     def _end_session(self) -> None:
         """Leave the session; odometry of the next one goes on from where this one was."""

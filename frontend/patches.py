@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.frontend.kernels import native
+from seamark.frontend.pyramid import Pyramid
 
 
 def align_along(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
+    left: Pyramid,
+    right: Pyramid,
     points: NDArray[np.floating],
     start: NDArray[np.floating],
     directions: NDArray[np.floating],
@@ -26,31 +27,23 @@ def align_along(
     Returns the points (N, 2) float32 and the zero-mean normalised correlation (N,) float32 at the end, in -1..1; what
     is not finite stays where it is, with correlation 0.
     """
-    return native.align_along(
-        np.ascontiguousarray(left), np.ascontiguousarray(right), _floats(points), _floats(start), _floats(directions)
-    )
+    return native.align_along(left, right, _floats(points), _floats(start), _floats(directions))
 
 
 def align_warped(
-    reference: NDArray[np.uint8],
-    grey: NDArray[np.uint8],
+    reference: Pyramid,
+    image: Pyramid,
     points: NDArray[np.floating],
     start: NDArray[np.floating],
     warps: NDArray[np.floating],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Move ``start`` (N, 2) in a grey image until its patch looks like the reference's at ``points`` (N, 2), warped.
+    """Move ``start`` (N, 2) in an image until its patch looks like the reference's at ``points`` (N, 2), warped.
 
     ``warps`` (N, 2, 2) maps offsets in the reference to offsets in the image. Returns the points (N, 2) float32 and the
     zero-mean normalised correlation (N,) float32 at the end, in -1..1; what is not finite stays where it is, with
     correlation 0.
     """
-    return native.align_warped(
-        np.ascontiguousarray(reference),
-        np.ascontiguousarray(grey),
-        _floats(points),
-        _floats(start),
-        _floats(np.linalg.inv(warps)),
-    )
+    return native.align_warped(reference, image, _floats(points), _floats(start), _floats(np.linalg.inv(warps)))
 
 
 def _floats(values: NDArray[np.floating]) -> NDArray[np.float32]:

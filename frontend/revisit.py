@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from seamark.frontend import flow, se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.window import WindowKeyframe
 
@@ -41,13 +42,13 @@ def worth_revisiting(
 def find_again(
     old: WindowKeyframe,
     positions: NDArray[np.float64],
-    grey: NDArray[np.uint8],
+    image: Pyramid,
     T_odom_cam: NDArray[np.float64],
     camera: Camera,
     live: Tracks,
     config: FrontendConfig,
 ) -> Tracks:
-    """Find landmarks of an old keyframe in the current grey image.
+    """Find landmarks of an old keyframe in the current image.
 
     ``positions`` (M, 3) are those of ``old.track_ids`` in the odometry frame, NaN where unknown. Returns the tracks
     that were found, none of which is among the ``live`` ones or on top of one.
@@ -63,13 +64,14 @@ def find_again(
     if len(rows) == 0:
         return Tracks.none()
     there, ok = flow.track(
-        old.grey,
-        grey,
+        old.image,
+        image,
         old.seen[rows],
         expected,
         window_px=config.flow_window_px,
         levels=LEVELS,
         round_trip_px=0.5 * config.flow_round_trip_px,
+        min_correlation=config.flow_min_correlation,
     )
     ok &= np.linalg.norm(there - expected, axis=1) < config.revisit_search_px
     if len(live):

@@ -13,6 +13,7 @@ from seamark.frontend.detectors import find_corners
 from seamark.frontend.masks import Mask
 from seamark.frontend.pose import Prediction
 from seamark.frontend.presumed import SPREAD, presume
+from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.residuals import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import Tracks
@@ -106,8 +107,8 @@ class Session:
         known = int(np.isfinite(spread).sum())
         return float((spread < NEAR_SPREAD).sum()) / known if known else 0.0
 
-    def revisit(self, grey: NDArray[np.uint8]) -> None:
-        """Take up landmarks of archived keyframes that the current grey image shows again."""
+    def revisit(self, image: Pyramid) -> None:
+        """Take up landmarks of archived keyframes that the current image shows again."""
         self.anchors = []
         live = self.landmarks.get(self.tracks.ids)
         live = live[np.isfinite(live[:, 0])]
@@ -116,7 +117,7 @@ class Session:
         depth = float(np.median(se3.transform(se3.inverse(self.T_odom_cam), live)[:, 2]))
         for old in worth_revisiting(self.archive, self.T_odom_cam, depth, self.config):
             positions = self.landmarks.get(old.track_ids)
-            found = find_again(old, positions, grey, self.T_odom_cam, self.camera, self.tracks, self.config)
+            found = find_again(old, positions, image, self.T_odom_cam, self.camera, self.tracks, self.config)
             self.tracks = self.tracks + found
             if np.isin(old.track_ids, self.tracks.ids).sum() >= self.config.revisit_min_landmarks:
                 self.anchors.append(old)
@@ -125,16 +126,16 @@ class Session:
         self,
         keyframe_id: int | None,
         stamp_ns: int,
-        grey: NDArray[np.uint8],
+        image: Pyramid,
         T_odom_cam: NDArray[np.float64],
         inverse_depth: NDArray[np.float64],
         inverse_sigma: NDArray[np.float64],
     ) -> None:
-        """Add the live tracks, seen in a grey image, as a keyframe: new landmarks, then the window adjusted."""
+        """Add the live tracks, seen in an image, as a keyframe: new landmarks, then the window adjusted."""
         ids, seen = self.tracks.ids, self.tracks.pixels
         pixels = self.camera.undistort(seen)
         self.window.append(
-            WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, grey, ids, seen, pixels, inverse_depth, inverse_sigma)
+            WindowKeyframe(keyframe_id, stamp_ns, T_odom_cam, image, ids, seen, pixels, inverse_depth, inverse_sigma)
         )
         if keyframe_id is not None:
             self.mapped = self.reference

@@ -24,10 +24,10 @@ def tone_curve(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[n
     return None if change < MIN_CHANGE_GREY else np.rint(curve).astype(np.uint8)
 
 
-def match_tone(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return one grey image in the tone of another of its size; the image itself where they hardly differ."""
+def match_tone(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
+    """Return one grey image in the tone of another of its size, None where it has it."""
     curve = tone_curve(before, after)
-    return before if curve is None else cv2.LUT(before, curve)
+    return None if curve is None else cv2.LUT(before, curve)
 
 
 def _histogram(grey: NDArray[np.uint8]) -> NDArray[np.float64]:

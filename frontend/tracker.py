@@ -8,6 +8,7 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.depth import DepthImage, DepthSensor
 from seamark.frontend.patches import align_warped
 from seamark.frontend.pose import PoseEstimate, estimate_pose
+from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
 from seamark.frontend.tone import match_tone
 from seamark.frontend.tracks import Tracks
@@ -42,10 +43,8 @@ def predict_pixels(session: Session, tracks: Tracks) -> NDArray[np.float32]:
     return guess
 
 
-def follow(
-    session: Session, before: NDArray[np.uint8], after: NDArray[np.uint8], *, predict: bool
-) -> tuple[Tracks, NDArray[np.float32]]:
-    """Follow the live tracks into the next grey image; returns the survivors and where they were (N, 2).
+def follow(session: Session, before: Pyramid, after: Pyramid, *, predict: bool) -> tuple[Tracks, NDArray[np.float32]]:
+    """Follow the live tracks into the next image; returns the survivors and where they were (N, 2).
 
     Where half of the tracks are lost, the prediction was wrong, or the exposure has changed: they are then searched
     from where they were, and in the tone of the new image.
@@ -54,9 +53,7 @@ def follow(
     if len(tracks) == 0:
         return tracks, tracks.pixels
 
-    def attempt(
-        image: NDArray[np.uint8], guess: NDArray[np.float32] | None
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def attempt(image: Pyramid, guess: NDArray[np.float32] | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         return flow.track(
             image,
             after,
@@ -65,14 +62,15 @@ def follow(
             window_px=c.flow_window_px,
             levels=c.flow_levels,
             round_trip_px=c.flow_round_trip_px,
+            min_correlation=c.flow_min_correlation,
         )
 
     guess = predict_pixels(session, tracks) if predict else None
     there, ok = attempt(before, guess)
     if ok.mean() < RETRY_SURVIVORS:
-        toned = match_tone(before, after)
-        others: list[tuple[NDArray[np.uint8], NDArray[np.float32] | None]] = [(before, None)] if predict else []
-        others += [(toned, guess)] if toned is not before else []
+        others: list[tuple[Pyramid, NDArray[np.float32] | None]] = [(before, None)] if predict else []
+        toned = match_tone(before.grey, after.grey)
+        others += [(pyramid_of(toned, c.flow_levels), guess)] if toned is not None else []
         for again, ok_again in (attempt(*other) for other in others):
             if ok_again.sum() > ok.sum():
                 there, ok = again, ok_again
@@ -104,7 +102,7 @@ def estimate(
     return pose, keep
 
 
-def settle(session: Session, grey: NDArray[np.uint8], tracks: Tracks, T_odom_cam: NDArray[np.float64]) -> Tracks:
+def settle(session: Session, image: Pyramid, tracks: Tracks, T_odom_cam: NDArray[np.float64]) -> Tracks:
     """Align tracks once more with their patches in the newest keyframe, warped as the pose says; undoes their drift."""
     reference, camera = session.reference, session.camera
     _, mine, theirs = np.intersect1d(tracks.ids, reference.track_ids, assume_unique=True, return_indices=True)
@@ -117,7 +115,7 @@ def settle(session: Session, grey: NDArray[np.uint8], tracks: Tracks, T_odom_cam
     with np.errstate(invalid="ignore", divide="ignore"):
         sound = np.abs(np.log(scale)) < MAX_LOG_SCALE
     mine, theirs, warps = mine[sound], theirs[sound], warps[sound]
-    there, correlation = align_warped(reference.grey, grey, reference.seen[theirs], tracks.pixels[mine], warps)
+    there, correlation = align_warped(reference.image, image, reference.seen[theirs], tracks.pixels[mine], warps)
     moved = np.linalg.norm(there - tracks.pixels[mine], axis=1)
     good = (correlation > MIN_CORRELATION) & (moved < MAX_SETTLING_PX)
     pixels = tracks.pixels.copy()

@@ -14,6 +14,7 @@ from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.kernels import native
+from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.residuals import Observations
 
 INITIAL_DAMPING = 1e-4
@@ -25,14 +26,14 @@ class WindowKeyframe:
     """What the window keeps of a keyframe: its pose and what it saw.
 
     ``id`` is the keyframe's in the map, None for one that serves the window only.
-    ``track_ids`` (M,) int64, ``seen`` (M, 2) float32 pixels as seen in ``grey`` (H, W), ``pixels`` (M, 2) the ideal
+    ``track_ids`` (M,) int64, ``seen`` (M, 2) float32 pixels as seen in ``image``, ``pixels`` (M, 2) the ideal
     ones, ``inverse_depth`` and ``inverse_sigma`` (M,) NaN where unknown.
     """
 
     id: int | None
     stamp_ns: int
     T_odom_cam: NDArray[np.float64]
-    grey: NDArray[np.uint8]
+    image: Pyramid
     track_ids: NDArray[np.int64]
     seen: NDArray[np.float32]
     pixels: NDArray[np.float64]

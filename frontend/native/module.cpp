@@ -3,15 +3,20 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <optional>
 #include <stdexcept>
+#include <string>
 #include <tuple>
 #include <vector>
 
+#include "flow.hpp"
 #include "patches.hpp"
 #include "pose.hpp"
+#include "pyramid.hpp"
 #include "window.hpp"
 
 namespace nb = nanobind;
@@ -38,25 +43,65 @@ Out<T, Shape...> give(std::vector<T> values, std::initializer_list<size_t> shape
     return Out<T, Shape...>(kept->data(), shape, owner);
 }
 
-Image image_of(const Grey& grey) {
-    require(grey.shape(0) > 0 && grey.shape(1) > 0, "an image needs pixels");
-    return {grey.data(), static_cast<int>(grey.shape(1)), static_cast<int>(grey.shape(0))};
-}
-
 using Aligned = std::tuple<Out<float, -1, 2>, Out<float, -1>>;
 
 template <class Align, class Hints>
-Aligned aligned(Align align, const Grey& source, const Grey& target, const Pixels& points, const Pixels& start,
+Aligned aligned(Align align, const Pyramid& source, const Pyramid& target, const Pixels& points, const Pixels& start,
                 const Hints& hints) {
     const size_t n = points.shape(0);
     require(start.shape(0) == n && hints.shape(0) == n, "each point needs a start and a direction or warp");
-    const Image from = image_of(source), to = image_of(target);
     std::vector<float> there(start.data(), start.data() + 2 * n), correlations(n);
     {
         nb::gil_scoped_release free;
-        align(from, to, points.data(), hints.data(), static_cast<int64_t>(n), there.data(), correlations.data());
+        align(source[0], target[0], points.data(), hints.data(), static_cast<int64_t>(n), there.data(), correlations.data());
     }
     return {give<float, -1, 2>(std::move(there), {n, 2}), give<float, -1>(std::move(correlations), {n})};
+}
+
+void make_pyramid(Pyramid* self, const Grey& grey, int levels) {
+    require(levels >= 0 && levels <= 8, "a pyramid has 0 to 8 reduced levels");
+    require(grey.shape(0) > 0 && grey.shape(1) > 0, "an image needs pixels");
+    require(grey.shape(0) < 32768 && grey.shape(1) < 32768, "an image has less than 32768 rows and columns");
+    nb::gil_scoped_release free;
+    new (self) Pyramid(grey.data(), static_cast<int>(grey.shape(1)), static_cast<int>(grey.shape(0)), levels);
+}
+
+// A view, whose owner is the pyramid.
+nb::ndarray<nb::numpy, const uint8_t, nb::ndim<2>> level_of(const Pyramid& pyramid, int level) {
+    require(level >= 0 && level <= pyramid.top(), "a pyramid has no such level");
+    const Level& of = pyramid[level];
+    return {of.pixels, {static_cast<size_t>(of.height), static_cast<size_t>(of.width)}, nb::find(&pyramid), {of.stride, 1}};
+}
+
+const FlowKernels& flow_kernels_named(const std::optional<std::string>& level) {
+    const FlowKernels* chosen = nullptr;
+    for (const FlowKernels* const* each = flow_levels(); *each; ++each)
+        if (!level || *level == (*each)->name) chosen = *each;
+    if (!chosen) throw std::invalid_argument("this processor has no level " + *level);
+    return *chosen;
+}
+
+std::vector<std::string> levels() {
+    std::vector<std::string> names;
+    for (const FlowKernels* const* each = flow_levels(); *each; ++each) names.emplace_back((*each)->name);
+    return names;
+}
+
+std::tuple<Out<float, -1, 2>, Out<float, -1>, Out<float, -1>> followed(
+    const Pyramid& before, const Pyramid& after, const Pixels& points, const Pixels& start, int side, int top,
+    int back_top, const std::optional<std::string>& level) {
+    const size_t n = points.shape(0);
+    require(start.shape(0) == n, "each point needs a start");
+    require(side >= 5 && side <= kMaxSide && side % 2 == 1, "the side of a patch is odd, from 5 to 29");
+    const FlowKernels& kernels = flow_kernels_named(level);
+    std::vector<float> there(start.data(), start.data() + 2 * n), round_trip(n), likeness(n);
+    {
+        nb::gil_scoped_release free;
+        follow(before, after, points.data(), static_cast<int64_t>(n), {side / 2, top, back_top}, kernels, there.data(),
+               round_trip.data(), likeness.data());
+    }
+    return {give<float, -1, 2>(std::move(there), {n, 2}), give<float, -1>(std::move(round_trip), {n}),
+            give<float, -1>(std::move(likeness), {n})};
 }
 
 using Vector = In<double, -1>;
@@ -167,15 +212,24 @@ std::tuple<Out<double, -1, 4, 4>, Out<double, -1, 3>, Out<double, -1>, Out<doubl
 
 NB_MODULE(_native, m) {
     m.doc() = "Kernels of the front end; seamark.frontend.patches, pose and window are their users' side.";
+    m.def("levels", &levels);
+    nb::class_<Pyramid>(m, "Pyramid")
+        .def("__init__", &make_pyramid, "grey"_a.noconvert(), "levels"_a)
+        .def_prop_ro("top", &Pyramid::top)
+        .def_prop_ro("grey", [](const Pyramid& self) { return level_of(self, 0); })
+        .def("level", &level_of, "level"_a);
+    m.def("follow", &followed, "before"_a, "after"_a, "points"_a, "start"_a, "side"_a, "top"_a, "back_top"_a,
+          "level"_a = nb::none());
     m.def(
         "align_along",
-        [](const Grey& source, const Grey& target, const Pixels& points, const Pixels& start, const Pixels& along) {
+        [](const Pyramid& source, const Pyramid& target, const Pixels& points, const Pixels& start,
+           const Pixels& along) {
             return aligned(align_along, source, target, points, start, along);
         },
         "source"_a, "target"_a, "points"_a, "start"_a, "directions"_a);
     m.def(
         "align_warped",
-        [](const Grey& source, const Grey& target, const Pixels& points, const Pixels& start,
+        [](const Pyramid& source, const Pyramid& target, const Pixels& points, const Pixels& start,
            const In<float, -1, 2, 2>& unwarp) { return aligned(align_warped, source, target, points, start, unwarp); },
         "source"_a, "target"_a, "points"_a, "start"_a, "unwarp"_a);
     m.def("refine_pose", &refined, "T_odom_cam"_a, "landmarks"_a, "pixels"_a, "inverse_depth"_a, "inverse_sigma"_a,

@@ -77,7 +77,7 @@ SEAMARK_INLINE void between(const float values[kSide + 1][kStride], float u, flo
 
 // The same as below where the patch reaches the border: values beyond are those of the border, and no gradient leads
 // across it, so that what is not in the image does not pull.
-SEAMARK_INLINE void sample_at_border(const Image& image, int left, int top, float u, float v, Patch& out) {
+SEAMARK_INLINE void sample_at_border(const Level& image, int left, int top, float u, float v, Patch& out) {
     float grey[kSide + 1][kStride], across[kSide + 1][kStride], down[kSide + 1][kStride];
     for (int i = 0; i <= kSide; ++i)
         for (int j = 0; j < kStride; ++j) {
@@ -85,7 +85,7 @@ SEAMARK_INLINE void sample_at_border(const Image& image, int left, int top, floa
             float at[3][3];
             for (int dy = -1; dy <= 1; ++dy)
                 for (int dx = -1; dx <= 1; ++dx)
-                    at[dy + 1][dx + 1] = image.pixels[static_cast<int64_t>(mirrored(y + dy, image.height)) * image.width +
+                    at[dy + 1][dx + 1] = image.pixels[image.stride * mirrored(y + dy, image.height) +
                                                       mirrored(x + dx, image.width)];
             grey[i][j] = at[1][1];
             across[i][j] = (3 * (at[0][2] - at[0][0] + at[2][2] - at[2][0]) + 10 * (at[1][2] - at[1][0])) / 32;
@@ -98,7 +98,7 @@ SEAMARK_INLINE void sample_at_border(const Image& image, int left, int top, floa
 }
 
 // Reads the patch around a point, taking off its mean; with gradients in grey levels per pixel.
-SEAMARK_INLINE void sample(const Image& image, const float* point, Patch& out) {
+SEAMARK_INLINE void sample(const Level& image, const float* point, Patch& out) {
     const float floor_x = std::floor(point[0]), floor_y = std::floor(point[1]);
     const float u = point[0] - floor_x, v = point[1] - floor_y;
     const int left = static_cast<int>(floor_x) - kAround, top = static_cast<int>(floor_y) - kAround;
@@ -108,7 +108,7 @@ SEAMARK_INLINE void sample(const Image& image, const float* point, Patch& out) {
     }
     float pixels[kRows + 1][kStride], samples[kRows][kStride];
     for (int y = 0; y <= kRows; ++y)
-        for (int x = 0; x < kStride; ++x) pixels[y][x] = image.pixels[static_cast<int64_t>(top + y) * image.width + left + x];
+        for (int x = 0; x < kStride; ++x) pixels[y][x] = image.pixels[image.stride * (top + y) + left + x];
     for (int y = 0; y < kRows; ++y) {
         float column[kStride];
         for (int x = 0; x < kStride; ++x) column[x] = pixels[y][x] + v * (pixels[y + 1][x] - pixels[y][x]);
@@ -173,7 +173,7 @@ SEAMARK_INLINE void step_freely(Patch& now, const Lanes* model, float* there) {
 }
 
 // Reads a patch whose offsets are changed by a (2, 2) matrix, taking off its mean.
-SEAMARK_INLINE void sample_changed(const Image& image, const float* point, const float* change, Lanes* out) {
+SEAMARK_INLINE void sample_changed(const Level& image, const float* point, const float* change, Lanes* out) {
     for (int y = 0; y < kSide; ++y) {
         float row[16] = {};
         for (int x = 0; x < kSide; ++x) {
@@ -182,8 +182,8 @@ SEAMARK_INLINE void sample_changed(const Image& image, const float* point, const
             const float at_y = std::min(std::max(point[1] + change[2] * dx + change[3] * dy, 0.0f), image.height - 1.0f);
             const int left = static_cast<int>(at_x), top = static_cast<int>(at_y);
             const int right = std::min(left + 1, image.width - 1), below = std::min(top + 1, image.height - 1);
-            const uint8_t* upper = image.pixels + static_cast<int64_t>(top) * image.width;
-            const uint8_t* lower = image.pixels + static_cast<int64_t>(below) * image.width;
+            const uint8_t* upper = image.pixels + image.stride * top;
+            const uint8_t* lower = image.pixels + image.stride * below;
             const float u = at_x - left, v = at_y - top;
             const float over = upper[left] + u * (upper[right] - upper[left]);
             const float under = lower[left] + u * (lower[right] - lower[left]);
@@ -196,7 +196,7 @@ SEAMARK_INLINE void sample_changed(const Image& image, const float* point, const
 
 }  // namespace
 
-SEAMARK_CLONES void align_along(const Image& source, const Image& target, const float* points, const float* directions,
+SEAMARK_CLONES void align_along(const Level& source, const Level& target, const float* points, const float* directions,
                                 int64_t n, float* there, float* correlations) {
     Patch model, now;
     for (int64_t i = 0; i < n; ++i, points += 2, directions += 2, there += 2) {
@@ -212,7 +212,7 @@ SEAMARK_CLONES void align_along(const Image& source, const Image& target, const 
     }
 }
 
-SEAMARK_CLONES void align_warped(const Image& source, const Image& target, const float* points, const float* unwarp,
+SEAMARK_CLONES void align_warped(const Level& source, const Level& target, const float* points, const float* unwarp,
                                  int64_t n, float* there, float* correlations) {
     Patch now;
     Lanes model[kSide];

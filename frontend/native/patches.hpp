@@ -3,21 +3,18 @@
 
 #include <cstdint>
 
-namespace seamark {
+#include "pyramid.hpp"
 
-struct Image {
-    const uint8_t* pixels;
-    int width, height;
-};
+namespace seamark {
 
 // Moves `there` (n, 2) in `target` along unit `directions` (n, 2) until its patch looks like that of `source` around
 // `points` (n, 2). Writes the correlations (n,) at the end.
-void align_along(const Image& source, const Image& target, const float* points, const float* directions, int64_t n,
+void align_along(const Level& source, const Level& target, const float* points, const float* directions, int64_t n,
                  float* there, float* correlations);
 
 // Moves `there` (n, 2) in `target` until its patch looks like that of `source` around `points` (n, 2), whose offsets
 // are those of the target times `unwarp` (n, 2, 2).
-void align_warped(const Image& source, const Image& target, const float* points, const float* unwarp, int64_t n,
+void align_warped(const Level& source, const Level& target, const float* points, const float* unwarp, int64_t n,
                   float* there, float* correlations);
 
 }  // namespace seamark

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from seamark.frontend import flow
 from seamark.frontend.corners import detect_corners
 from seamark.frontend.features import extract_features, grey_of, match_descriptors, root_sift, thumbnail_of
 
@@ -81,22 +80,6 @@ def test_corners_are_spread_and_keep_away_from_occupied_cells(harris: bool) -> N
     gaps = np.linalg.norm(again[:, None] - corners[None], axis=2) if len(again) else np.full((1, 1), np.inf)
     assert gaps.min() > 3
     assert len(detect_corners(np.full_like(image, 7), np.zeros((0, 2)), 200, harris=harris, min_response=2e-5)) == 0
-
-
-def test_flow_follows_a_known_shift_and_gives_up_what_leaves_the_image() -> None:
-    image = textured()
-    shift = np.array([6.5, -3.25])
-    moved = cv2.warpAffine(image, np.array([[1, 0, shift[0]], [0, 1, shift[1]]]), (320, 240), borderMode=1)
-    points = detect_corners(image, np.zeros((0, 2)), 200, harris=False, min_response=2e-5)
-    points = np.vstack([points, [[318, 100], [100, 1]]]).astype(np.float32)
-    there, ok = flow.track(image, moved, points, None, window_px=21, levels=3, round_trip_px=0.8)
-    assert ok[:-2].mean() > 0.9
-    assert not ok[-2:].any()
-    error = np.linalg.norm(there[ok] - points[ok] - shift, axis=1)
-    assert 0 < np.median(error) < 0.05
-    nothing, none = flow.track(image, moved, points[:0], None, window_px=21, levels=3, round_trip_px=0.8)
-    assert nothing.shape == (0, 2)
-    assert none.shape == (0,)
 
 
 def test_grey_is_the_image_itself_where_it_is_grey() -> None:

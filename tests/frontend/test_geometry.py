@@ -11,6 +11,7 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.pose import Prediction, estimate_pose, refine_pose
 from seamark.frontend.presumed import SPREAD, presume
+from seamark.frontend.pyramid import pyramid_of
 from seamark.frontend.residuals import Observations, residuals_and_jacobian
 from seamark.frontend.session import Session
 from seamark.frontend.two_view import initialise, triangulate
@@ -245,14 +246,14 @@ def test_a_track_that_never_ends_does_not_make_a_session_grow() -> None:
     """Test: dirt on the lens is tracked for 80 keyframes, all else for 3. Expected: the state stays bounded."""
     config = FrontendConfig(window_keyframes=3, window_iterations=1, archive_keyframes=2)
     session = Session(0, config, CAMERA, True, np.eye(4), DepthOffset.expected(0.0))
-    grey = np.zeros((480, 640), np.uint8)
+    image = pyramid_of(np.zeros((480, 640), np.uint8), 0)
     rng = np.random.default_rng(6)
     for k in range(80):
         session.tracks = session.tracks[(session.tracks.ids == 0) | (session.tracks.ids > 40 * (k - 3))]
         session.new_tracks(rng.uniform(0, 480, (40, 2)).astype(np.float32))
         depth = np.full(len(session.tracks), np.nan)
         depth[1:] = 0.5
-        session.insert_keyframe(k, k, grey, np.eye(4), depth, np.full(len(depth), 0.01))
+        session.insert_keyframe(k, k, image, np.eye(4), depth, np.full(len(depth), 0.01))
     assert session.tracks.ids[0] == 0
     assert session.next_track_id == 3200
     assert len(session.archive) == 2

@@ -13,6 +13,7 @@ from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.kernels import native
 from seamark.frontend.patches import align_along, align_warped
 from seamark.frontend.pose import Prediction, refine_pose, whitened_errors
+from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.residuals import Observations, residuals_and_jacobian, shift_of_distance
 from seamark.frontend.window import INITIAL_DAMPING, RELATIVE_DECREASE, BundleProblem, adjust
 
@@ -77,6 +78,10 @@ def warped_in_numpy(reference: Array, grey: Array, points: Array, start: Array, 
     return there, likeness(patches(image, there), template)
 
 
+def ready(*images: NDArray[np.uint8]) -> list[Pyramid]:
+    return [pyramid_of(image, 0) for image in images]
+
+
 def texture(seed: int) -> NDArray[np.uint8]:
     noise = np.random.default_rng(seed).normal(size=(200, 260)).astype(np.float32)
     return np.clip(128 + 240 * cv2.GaussianBlur(noise, (0, 0), 1.8), 0, 255).astype(np.uint8)
@@ -100,12 +105,12 @@ def test_patches_go_where_numpy_says(moved: tuple[NDArray[np.uint8], NDArray[np.
     angles = rng.uniform(0, 2 * np.pi, 150)
     along = np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
     for kernel, reference, hint in ((align_warped, warped_in_numpy, warps), (align_along, along_in_numpy, along)):
-        there, likeness = kernel(image, other, points, start, hint)
+        there, likeness = kernel(*ready(image, other), points, start, hint)
         expected, expected_likeness = reference(image, other, points, start, hint)
         assert 0.1 < np.linalg.norm(there - start, axis=1).mean() < 2
         np.testing.assert_allclose(there, expected, atol=1e-3)
         np.testing.assert_allclose(likeness, expected_likeness, atol=1e-3)
-        again = kernel(image, other, points, start, hint)
+        again = kernel(*ready(image, other), points, start, hint)
         assert there.tobytes() == again[0].tobytes() and likeness.tobytes() == again[1].tobytes()
 
 
@@ -117,7 +122,7 @@ def test_patches_at_the_border_go_where_numpy_says() -> None:
     ).astype(np.float32)
     start = points + rng.uniform(-0.4, 0.4, points.shape).astype(np.float32)
     warps = np.tile(np.array([[1.05, 0.1], [-0.1, 0.95]]), (100, 1, 1))
-    there, likeness = align_warped(image, image, points, start, warps)
+    there, likeness = align_warped(*ready(image, image), points, start, warps)
     expected, expected_likeness = warped_in_numpy(image, image, points, start, warps)
     np.testing.assert_allclose(there, expected, atol=5e-3)  # there is little to hold some of them
     np.testing.assert_allclose(likeness, expected_likeness, atol=2e-3)
@@ -128,7 +133,7 @@ def test_patches_that_are_nowhere_stay() -> None:
     points = np.array([[50, 50], [np.nan, 3], [1e30, 4], [60, 60]], np.float32)
     warps = np.tile(np.eye(2), (4, 1, 1))
     warps[3] = np.nan
-    there, likeness = align_warped(image, image, points, points, warps)
+    there, likeness = align_warped(*ready(image, image), points, points, warps)
     np.testing.assert_array_equal(there[1:], points[1:])
     assert likeness[0] > 0.999 and (likeness[1:] == 0).all()
 
@@ -290,9 +295,9 @@ def test_window_is_that_of_the_whole_system_in_numpy(seed: int, iterations: int)
 def test_kernels_refuse_what_does_not_fit() -> None:
     image, points = texture(0), np.zeros((3, 2), np.float32)
     with pytest.raises(ValueError, match="start"):
-        native.align_along(image, image, points, points[:2], points)
+        native.align_along(*ready(image, image), points, points[:2], points)
     with pytest.raises(TypeError):
-        native.align_along(image[None], image, points, points, points)
+        native.align_along(image, image, points, points, points)
     p = window(0)
     numbers = ((420.0, 410.0, 322.0, 238.0), 0.7, 0.0, 1.0, 1, 1e-4, 1e-4)
     arrays = p.measured.pixels, p.measured.inverse_depth, p.measured.inverse_sigma

@@ -7,11 +7,13 @@ import pytest
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.patches import align_along, align_warped
+from seamark.frontend.pyramid import pyramid_of
 from seamark.frontend.tracker import patch_warps
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.normal(size=(240, 320)).astype(np.float32)
 TEXTURE = np.clip(128 + 260 * cv2.GaussianBlur(NOISE, (0, 0), 2.0), 0, 255).astype(np.uint8)
+READY = pyramid_of(TEXTURE, 0)
 POINTS = np.stack(np.meshgrid(np.arange(60, 260, 25.0), np.arange(60, 180, 25.0)), -1).reshape(-1, 2)
 
 
@@ -32,13 +34,13 @@ def test_points_are_found_under_a_known_warp(A: np.ndarray) -> None:
     image = np.clip(image.astype(float) + 12, 0, 255).astype(np.uint8)
     start = true + RNG.uniform(-0.7, 0.7, true.shape)
     warps = np.tile(A, (len(POINTS), 1, 1))
-    there, correlation = align_warped(TEXTURE, image, POINTS, start, warps)
+    there, correlation = align_warped(READY, pyramid_of(image, 0), POINTS, start, warps)
     error = np.linalg.norm(there - true, axis=1)
     assert 0 < np.median(error) < 0.05
     assert np.mean(error < 0.15) > 0.9
     assert np.median(correlation) > 0.97
     if not np.allclose(A, np.eye(2)):
-        plain, _ = align_warped(TEXTURE, image, POINTS, start, np.tile(np.eye(2), (len(POINTS), 1, 1)))
+        plain, _ = align_warped(READY, pyramid_of(image, 0), POINTS, start, np.tile(np.eye(2), (len(POINTS), 1, 1)))
         assert np.median(np.linalg.norm(plain - true, axis=1)) > 1.5 * np.median(error)
 
 
@@ -46,7 +48,7 @@ def test_a_line_keeps_the_point_on_it() -> None:
     image, true = warped(np.eye(2), np.array([2.3, 0.0]))
     start = true + np.column_stack([RNG.uniform(-0.8, 0.8, len(true)), np.zeros(len(true))])
     along = np.tile([1.0, 0.0], (len(true), 1))
-    there, correlation = align_along(TEXTURE, image, POINTS, start, along)
+    there, correlation = align_along(READY, pyramid_of(image, 0), POINTS, start, along)
     np.testing.assert_allclose(there[:, 1], start[:, 1], atol=1e-4)
     assert np.median(np.abs(there[:, 0] - true[:, 0])) < 0.06  # OpenCV warps in steps of 1/32 px
     assert np.median(correlation) > 0.97
@@ -54,13 +56,13 @@ def test_a_line_keeps_the_point_on_it() -> None:
 
 def test_nothing_and_nowhere() -> None:
     nothing = np.zeros((0, 2))
-    assert len(align_warped(TEXTURE, TEXTURE, nothing, nothing, np.zeros((0, 2, 2)))[0]) == 0
-    assert len(align_along(TEXTURE, TEXTURE, nothing, nothing, nothing)[0]) == 0
-    flat = np.full_like(TEXTURE, 90)
+    assert len(align_warped(READY, READY, nothing, nothing, np.zeros((0, 2, 2)))[0]) == 0
+    assert len(align_along(READY, READY, nothing, nothing, nothing)[0]) == 0
+    flat = pyramid_of(np.full_like(TEXTURE, 90), 0)
     there, correlation = align_warped(flat, flat, POINTS, POINTS, np.tile(np.eye(2), (len(POINTS), 1, 1)))
     assert np.isfinite(there).all() and (correlation < 0.5).all()
     far = POINTS + 10_000
-    assert np.isfinite(align_warped(TEXTURE, TEXTURE, far, far, np.tile(np.eye(2), (len(POINTS), 1, 1)))[0]).all()
+    assert np.isfinite(align_warped(READY, READY, far, far, np.tile(np.eye(2), (len(POINTS), 1, 1)))[0]).all()
 
 
 def test_warps_are_those_of_a_plane_that_faces_the_reference() -> None:

@@ -9,6 +9,7 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.corners import detect_corners
 from seamark.frontend.features import grey_of
 from seamark.frontend.odometry import Frontend
+from seamark.frontend.pyramid import pyramid_of
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.types import Frame, Mode
@@ -32,7 +33,7 @@ def keyframe_of(frame: Frame, T: np.ndarray) -> tuple[WindowKeyframe, np.ndarray
     positions = se3.transform(T, WORLD.camera.rays(seen) * depth[:, None])
     unknown = np.full(len(seen), np.nan)
     ids = np.arange(len(seen))
-    return WindowKeyframe(0, 0, T, grey, ids, seen, seen.astype(float), unknown, unknown), positions
+    return WindowKeyframe(0, 0, T, pyramid_of(grey, 4), ids, seen, seen.astype(float), unknown, unknown), positions
 
 
 @pytest.mark.parametrize("error_m", [0.0, 0.04])
@@ -42,9 +43,9 @@ def test_landmarks_are_found_where_the_truth_projects_them(error_m: float) -> No
     old, positions = keyframe_of(WORLD.render(T_old), T_old)
     assert len(positions) > 80
     T_believed = T_now @ se3.make(np.eye(3), np.array([error_m, 0, 0]))
-    grey = grey_of(WORLD.render(T_now, index=1).image)
+    image = pyramid_of(grey_of(WORLD.render(T_now, index=1).image), 4)
     live = Tracks(old.track_ids[:20], np.zeros((20, 2), np.float32))
-    found = find_again(old, positions, grey, T_believed, WORLD.camera, live, CONFIG)
+    found = find_again(old, positions, image, T_believed, WORLD.camera, live, CONFIG)
     assert not np.isin(found.ids, live.ids).any()
     assert len(found) > 0.4 * len(positions)
     true = WORLD.camera.project(se3.transform(se3.inverse(T_now), positions[found.ids]))
@@ -56,11 +57,11 @@ def test_landmarks_are_found_where_the_truth_projects_them(error_m: float) -> No
 def test_nothing_is_found_in_another_view_or_without_landmarks() -> None:
     T_old = looking(0.0)
     old, positions = keyframe_of(WORLD.render(T_old), T_old)
-    grey = grey_of(WORLD.render(looking(np.pi)).image)
-    elsewhere = find_again(old, positions, grey, T_old, WORLD.camera, Tracks.none(), CONFIG)
+    image = pyramid_of(grey_of(WORLD.render(looking(np.pi)).image), 4)
+    elsewhere = find_again(old, positions, image, T_old, WORLD.camera, Tracks.none(), CONFIG)
     assert len(elsewhere) < 0.1 * len(positions)
     unknown = np.full_like(positions, np.nan)
-    assert len(find_again(old, unknown, old.grey, T_old, WORLD.camera, Tracks.none(), CONFIG)) == 0
+    assert len(find_again(old, unknown, old.image, T_old, WORLD.camera, Tracks.none(), CONFIG)) == 0
 
 
 def test_the_views_most_alike_are_worth_revisiting() -> None:
