@@ -105,7 +105,7 @@ class InvertedIndex:
         self._check(words, None, None, False, False)
         present, count = _counted(words)
         most, mass = np.sqrt(count).astype(np.float32), self._mass(present, count)
-        return self._bounded(self._postings.votes(present, self._idf[present], most, mass))
+        return self._postings.votes(present, self._idf[present], most, mass)
 
     def near_votes(
         self,
@@ -134,10 +134,9 @@ class InvertedIndex:
         present, count = _counted(words)
         weights = np.repeat((self._idf[present] / np.sqrt(count)).astype(np.float32), count)
         mass = self._mass(present, count)
-        near = self._postings.near_votes(
+        return self._postings.near_votes(
             words[order], weights, mass, signatures[order], np.ascontiguousarray(table), _sorted(geometry, order)
         )
-        return self._bounded(near)
 
     def remove(self, slot: int) -> None:
         """Forget the place in a slot. Its postings are passed over from now on and go with :meth:`compact`.
@@ -182,10 +181,6 @@ class InvertedIndex:
                 raise ObservationError(
                     f"{name} must be {words.shape} {np.dtype(kind)}, not {array.shape} {array.dtype}"
                 )
-
-    @staticmethod
-    def _bounded(votes: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.minimum(votes, np.float32(1.0), out=votes)
 
 
 def best(scores: NDArray[np.float32], limit: int) -> NDArray[np.int32]:

@@ -74,6 +74,28 @@ def test_votes_equal_the_dense_similarity(level: str, block_places: int) -> None
         np.testing.assert_allclose(votes, [similarity(query, words) for words in places], atol=1e-6)
 
 
+def test_votes_of_more_places_than_are_summed_at_a_time() -> None:
+    """Sums are made over 8192 places at a time; the lists here are long, short, and empty in some of these sections."""
+    rng = np.random.default_rng(11)
+    words = np.minimum(rng.geometric(0.08, (20_000, 4)) - 1, N_WORDS - 5).astype(np.int32)
+    words[rng.choice(20_000, 30), 0] = N_WORDS - 1
+    words[[8191, 8192, 16383, 16384], 0] = N_WORDS - 2
+    index = InvertedIndex(IDF, block_places=18_000)
+    for place in words:
+        index.add(place)
+    index.remove(8192)
+    query = np.array([0, 0, 0, 3, 3, 9, 44, 48, 49], np.int32)
+    vectors = np.zeros((20_000, N_WORDS))
+    np.add.at(vectors, (np.arange(20_000)[:, None], words), 1)
+    vectors = np.sqrt(vectors) * IDF
+    own = dense(query)
+    expected = np.minimum(vectors, own).sum(axis=1) / np.maximum(vectors.sum(axis=1), own.sum())
+    expected[8192] = 0
+    votes = index.votes(query)
+    np.testing.assert_allclose(votes, expected, atol=1e-6)
+    assert votes[8191] > 0 and votes[16384] > 0
+
+
 @pytest.mark.parametrize("level", native.levels())
 @pytest.mark.parametrize("geometric", [False, True])
 def test_near_votes_equal_the_sum_over_pairs(level: str, geometric: bool) -> None:

@@ -11,6 +11,7 @@ namespace seamark {
 constexpr int kDescriptorSize = 128;
 constexpr int kGroup = 16;                                   // words per group
 constexpr int kGroupBytes = kGroup * kDescriptorSize;        // four dimensions of sixteen words, then the next four
+constexpr int kMostGroups = 16;  // of one call: 32 KiB of words, a first-level cache
 constexpr int kTile = 4;                                     // descriptors that are compared at a time
 
 struct Kernels {
@@ -20,6 +21,11 @@ struct Kernels {
     // squared distance less the descriptor's own square, bias - 2 sum w (d - 128), with bias = sum w^2 - 256 sum w.
     void (*distances)(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const uint8_t* const* descriptors,
                       int n, int32_t* out, int64_t stride);
+
+    // Finds for each of n <= kTile descriptors the word of n_groups groups (at most kMostGroups) that is nearest, the
+    // first of equally near ones: at[i] counts words, value[i] is what `distances` gives for it.
+    void (*nearest)(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const uint8_t* const* descriptors,
+                    int n, int32_t* value, int32_t* at);
 
     // Returns the position of the smallest of n > 0 values, the first of equal ones.
     int64_t (*smallest)(const int32_t* values, int64_t n);
@@ -32,6 +38,19 @@ struct Kernels {
     int64_t (*near_signatures)(const uint64_t* signatures, int64_t n, uint64_t query, int limit, uint32_t* positions,
                                uint8_t* distances);
 };
+
+// What `nearest` does, by way of `distances` and `smallest`, for levels without a faster one.
+template <class Distances, class Smallest>
+static void nearest_by(Distances distances, Smallest smallest, const uint8_t* groups, const int32_t* bias,
+                       int64_t n_groups, const uint8_t* const* descriptors, int n, int32_t* value, int32_t* at) {
+    constexpr int64_t kWidth = kMostGroups * kGroup;
+    int32_t all[kTile * kWidth];
+    distances(groups, bias, n_groups, descriptors, n, all, kWidth);
+    for (int i = 0; i < n; ++i) {
+        at[i] = static_cast<int32_t>(smallest(all + i * kWidth, n_groups * kGroup));
+        value[i] = all[i * kWidth + at[i]];
+    }
+}
 
 extern const Kernels kBaseline;
 #if defined(SEAMARK_X86_LEVELS)

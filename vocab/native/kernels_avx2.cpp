@@ -71,6 +71,11 @@ int64_t smallest(const int32_t* values, int64_t n) {
     return at;
 }
 
+void nearest(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const uint8_t* const* descriptors, int n,
+             int32_t* value, int32_t* at) {
+    nearest_by(distances, smallest, groups, bias, n_groups, descriptors, n, value, at);
+}
+
 int64_t at_most(const int32_t* values, int64_t n, int32_t limit, int32_t* positions) {
     int64_t found = 0;
     for (int64_t i = 0; i < n; ++i) {
@@ -94,6 +99,6 @@ int64_t near_signatures(const uint64_t* signatures, int64_t n, uint64_t query, i
 
 }  // namespace
 
-const Kernels kAvx2 = {"avx2", distances, smallest, at_most, near_signatures};
+const Kernels kAvx2 = {"avx2", distances, nearest, smallest, at_most, near_signatures};
 
 }  // namespace seamark

@@ -18,8 +18,9 @@ inline void add_products(__m512i& sum, __m512i words, __m512i chunk) {
     asm("vpdpbusd %2, %1, %0" : "+v"(sum) : "v"(words), "v"(chunk));
 }
 
-template <int N, int G>
-void columns(const uint8_t* groups, const int32_t* bias, const Shifted* shifted, int32_t* out, int64_t stride) {
+// Calls each(i, g, distances) for N descriptors and G groups.
+template <int N, int G, class Each>
+inline void columns(const uint8_t* groups, const int32_t* bias, const Shifted* shifted, Each each) {
     __m512i dot[N][G];
     for (int i = 0; i < N; ++i)
         for (int g = 0; g < G; ++g) dot[i][g] = _mm512_setzero_si512();
@@ -33,35 +34,81 @@ void columns(const uint8_t* groups, const int32_t* bias, const Shifted* shifted,
     }
     for (int g = 0; g < G; ++g) {
         const __m512i start = _mm512_loadu_si512(bias + g * kGroup);
-        for (int i = 0; i < N; ++i)
-            _mm512_storeu_si512(out + i * stride + g * kGroup, _mm512_sub_epi32(start, _mm512_slli_epi32(dot[i][g], 1)));
+        for (int i = 0; i < N; ++i) each(i, g, _mm512_sub_epi32(start, _mm512_slli_epi32(dot[i][g], 1)));
     }
 }
 
-template <int N>
-void tile(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const Shifted* shifted, int32_t* out,
-          int64_t stride) {
+// The same for all groups; one descriptor alone needs more groups at a time to keep the processor busy.
+template <int N, class Each>
+inline void tile(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const Shifted* shifted, Each each) {
+    constexpr int kAtATime = N == 1 ? 8 : 4;
     int64_t g = 0;
-    for (; g + 4 <= n_groups; g += 4)
-        columns<N, 4>(groups + g * kGroupBytes, bias + g * kGroup, shifted, out + g * kGroup, stride);
+    for (; g + kAtATime <= n_groups; g += kAtATime)
+        columns<N, kAtATime>(groups + g * kGroupBytes, bias + g * kGroup, shifted,
+                             [&](int i, int j, __m512i found) { each(i, g + j, found); });
     for (; g < n_groups; ++g)
-        columns<N, 1>(groups + g * kGroupBytes, bias + g * kGroup, shifted, out + g * kGroup, stride);
+        columns<N, 1>(groups + g * kGroupBytes, bias + g * kGroup, shifted,
+                      [&](int i, int, __m512i found) { each(i, g, found); });
 }
 
-void distances(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const uint8_t* const* descriptors, int n,
-               int32_t* out, int64_t stride) {
-    Shifted shifted[kTile];
+void shift(const uint8_t* const* descriptors, int n, Shifted* shifted) {
     const __m512i sign = _mm512_set1_epi8(static_cast<char>(0x80));
     for (int i = 0; i < n; ++i)
         for (int half = 0; half < 2; ++half) {
             const __m512i bytes = _mm512_loadu_si512(descriptors[i] + 64 * half);
             _mm512_store_si512(shifted[i].chunks + 16 * half, _mm512_xor_si512(bytes, sign));
         }
+}
+
+template <int N>
+void write_all(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const Shifted* shifted, int32_t* out,
+               int64_t stride) {
+    tile<N>(groups, bias, n_groups, shifted,
+            [&](int i, int64_t g, __m512i found) { _mm512_storeu_si512(out + i * stride + g * kGroup, found); });
+}
+
+void distances(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const uint8_t* const* descriptors, int n,
+               int32_t* out, int64_t stride) {
+    Shifted shifted[kTile];
+    shift(descriptors, n, shifted);
     switch (n) {
-        case 1: return tile<1>(groups, bias, n_groups, shifted, out, stride);
-        case 2: return tile<2>(groups, bias, n_groups, shifted, out, stride);
-        case 3: return tile<3>(groups, bias, n_groups, shifted, out, stride);
-        default: return tile<4>(groups, bias, n_groups, shifted, out, stride);
+        case 1: return write_all<1>(groups, bias, n_groups, shifted, out, stride);
+        case 2: return write_all<2>(groups, bias, n_groups, shifted, out, stride);
+        case 3: return write_all<3>(groups, bias, n_groups, shifted, out, stride);
+        default: return write_all<4>(groups, bias, n_groups, shifted, out, stride);
+    }
+}
+
+template <int N>
+void keep_nearest(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const Shifted* shifted, int32_t* value,
+                  int32_t* at) {
+    __m512i least[N], where[N];  // in each of sixteen lanes, and in which group
+    for (int i = 0; i < N; ++i) {
+        least[i] = _mm512_set1_epi32(0x7fffffff);
+        where[i] = _mm512_setzero_si512();
+    }
+    tile<N>(groups, bias, n_groups, shifted, [&](int i, int64_t g, __m512i found) {
+        const __mmask16 nearer = _mm512_cmplt_epi32_mask(found, least[i]);
+        where[i] = _mm512_mask_set1_epi32(where[i], nearer, static_cast<int>(g));
+        least[i] = _mm512_min_epi32(least[i], found);
+    });
+    const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (int i = 0; i < N; ++i) {
+        value[i] = _mm512_reduce_min_epi32(least[i]);
+        const __mmask16 equal = _mm512_cmpeq_epi32_mask(least[i], _mm512_set1_epi32(value[i]));
+        at[i] = _mm512_mask_reduce_min_epi32(equal, _mm512_add_epi32(_mm512_slli_epi32(where[i], 4), lane));
+    }
+}
+
+void nearest(const uint8_t* groups, const int32_t* bias, int64_t n_groups, const uint8_t* const* descriptors, int n,
+             int32_t* value, int32_t* at) {
+    Shifted shifted[kTile];
+    shift(descriptors, n, shifted);
+    switch (n) {
+        case 1: return keep_nearest<1>(groups, bias, n_groups, shifted, value, at);
+        case 2: return keep_nearest<2>(groups, bias, n_groups, shifted, value, at);
+        case 3: return keep_nearest<3>(groups, bias, n_groups, shifted, value, at);
+        default: return keep_nearest<4>(groups, bias, n_groups, shifted, value, at);
     }
 }
 
@@ -114,6 +161,6 @@ int64_t near_signatures(const uint64_t* signatures, int64_t n, uint64_t query, i
 
 }  // namespace
 
-const Kernels kAvx512 = {"avx512", distances, smallest, at_most, near_signatures};
+const Kernels kAvx512 = {"avx512", distances, nearest, smallest, at_most, near_signatures};
 
 }  // namespace seamark

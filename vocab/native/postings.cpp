@@ -7,60 +7,6 @@
 #include <numeric>
 
 namespace seamark {
-namespace {
-
-constexpr int64_t kHeadersAhead = 32;  // words between the prefetch of where a list begins and the look at it
-constexpr int64_t kLinesAhead = 48;    // cache lines between the prefetch of postings and their use
-constexpr int64_t kLine = 64;
-
-// Walks the lists of a query some lines ahead of the reader, one line for each that is read. Lists are short and far
-// apart, so the processor's own prefetching ends where it would begin to pay.
-class Scout {
-public:
-    Scout(const std::vector<ListView>& lists, bool signatures) : lists_(lists), signatures_(signatures) {
-        for (int64_t line = 0; line < kLinesAhead; ++line) step();
-    }
-    void step() {
-        while (next_ >= end_) {
-            if (at_ == lists_.size()) return;
-            const ListView& list = lists_[at_++];
-            next_ = signatures_ ? reinterpret_cast<const char*>(list.signatures) : reinterpret_cast<const char*>(list.ids);
-            end_ = next_ + list.n * (signatures_ ? 8 : 2);
-        }
-        __builtin_prefetch(next_);
-        next_ += kLine;
-    }
-
-private:
-    const std::vector<ListView>& lists_;
-    const bool signatures_;
-    size_t at_ = 0;
-    const char* next_ = nullptr;
-    const char* end_ = nullptr;
-};
-
-// Adds a vote to the bin of the difference in orientation and to that of the difference in scale.
-void count_geometry(int there, int here, float weight, float* bins) {
-    const int turn = ((there & 255) - (here & 255) + 256 + 8) & 255;  // bins are centred on no turn
-    const int growth = std::clamp(((there >> 8) - (here >> 8) + 8 + 128) >> 4, 0, kScaleBins - 1);
-    bins[turn >> 4] += weight;
-    bins[kOrientationBins + growth] += weight;
-}
-
-struct Sealed {
-    const Block& block;
-    int64_t n_words;
-
-    ListView list(int64_t l) const {
-        const uint32_t start = block.starts[l];
-        return {block.ids + start, l >= n_words ? block.codes + (start - block.starts[n_words]) : nullptr,
-                block.signatures ? block.signatures + start : nullptr,
-                block.geometry ? block.geometry + start : nullptr, block.starts[l + 1] - start};
-    }
-    void prefetch_header(int64_t l) const { __builtin_prefetch(block.starts + l); }
-};
-
-}  // namespace
 
 Block own(std::shared_ptr<BlockArrays> arrays, int64_t n_places) {
     Block block{n_places, arrays->starts.data(), arrays->ids.data(), arrays->codes.data(), nullptr, nullptr, arrays};
@@ -141,7 +87,7 @@ Block Postings::gather(int64_t first, int64_t n, const std::vector<int32_t>& ran
     for (int64_t l = 0; l < 2 * n_words_; ++l) {
         int64_t base = 0;
         for (const Block& block : from) {
-            const ListView list = Sealed{block, n_words_}.list(l);
+            const ListView list = SealedLists{block, n_words_}.list(l);
             for (int64_t i = 0; i < list.n; ++i) {
                 const int64_t id = rank[static_cast<size_t>(base + list.ids[i])] - first;
                 if (id < 0 || id >= n) continue;  // removed, or in another of the new blocks
@@ -177,121 +123,6 @@ Block Postings::freeze_head() const {
     }
     return own(std::move(arrays), head_.n_places());
 }
-
-template <class Lists>
-void Postings::look_up(const Lists& lists, const QueryView& query, std::vector<ListView>& found) const {
-    found.clear();
-    for (int64_t i = 0; i < query.n; ++i) {
-        if (i + kHeadersAhead < query.n) {
-            lists.prefetch_header(query.words[i + kHeadersAhead]);
-            lists.prefetch_header(query.words[i + kHeadersAhead] + n_words_);
-        }
-        found.push_back(lists.list(query.words[i]));
-        found.push_back(lists.list(query.words[i] + n_words_));
-    }
-}
-
-template <class Each>
-void Postings::visit_blocks(const QueryView& query, Each each) const {
-    std::vector<ListView> lists;
-    lists.reserve(static_cast<size_t>(2 * query.n));
-    int64_t first = 0;
-    for (const Block& block : sealed_) {
-        look_up(Sealed{block, n_words_}, query, lists);
-        each(first, lists);
-        first += block.n_places;
-    }
-    if (head_.n_places()) {
-        look_up(head_, query, lists);
-        each(first, lists);
-    }
-}
-
-Scores Postings::votes(const QueryView& query) const {
-    constexpr int64_t kPiece = kLine / 2;
-    const std::shared_lock reading(state_);
-    Scores scores = room(1);
-    visit_blocks(query, [&](int64_t first, const std::vector<ListView>& lists) {
-        float* places = scores.values.get() + first;
-        Scout scout(lists, false);
-        for (size_t l = 0; l < lists.size(); ++l) {
-            const ListView& list = lists[l];
-            const float weight = query.weights[l / 2], most = query.most[l / 2];
-            const float plain = weight * std::min(code_weights_[1], most);
-            for (int64_t from = 0; from < list.n; from += kPiece) {
-                scout.step();
-                const int64_t to = std::min(from + kPiece, list.n);
-                if (!list.codes) {
-                    for (int64_t j = from; j < to; ++j) places[list.ids[j]] += plain;
-                    continue;
-                }
-                for (int64_t j = from; j < to; ++j) {
-                    const uint8_t code = list.codes[j];
-                    places[list.ids[j]] += weight * (std::min(code_weights_[code], most) * code_shares_[code]);
-                }
-            }
-        }
-    });
-    return finished(std::move(scores), query.mass);
-}
-
-Scores Postings::near_votes(const QueryView& query, const float* table, int limit, bool geometric) const {
-    constexpr int64_t kBins = kOrientationBins + kScaleBins;
-    constexpr int64_t kPiece = 512;
-    const std::shared_lock reading(state_);
-    Scores total = room(geometric ? kBins : 1);
-    std::array<uint32_t, kPiece> positions;
-    std::array<uint8_t, kPiece> distances;
-    visit_blocks(query, [&](int64_t first, const std::vector<ListView>& lists) {
-        Scout signatures(lists, true), ids(lists, false);
-        for (size_t l = 0; l < lists.size(); ++l) {
-            const ListView& list = lists[l];
-            const size_t i = l / 2;
-            for (int64_t from = 0; from < list.n; from += kPiece) {
-                const int64_t n = std::min(kPiece, list.n - from);
-                for (int64_t line = 0; line < n; line += kLine / 8) signatures.step();
-                for (int64_t line = 0; line < n; line += kLine / 2) ids.step();
-                const int64_t found = kernels_.near_signatures(list.signatures + from, n, query.signatures[i], limit,
-                                                               positions.data(), distances.data());
-                for (int64_t j = 0; j < found; ++j) {
-                    const int64_t at = from + positions[static_cast<size_t>(j)];
-                    const uint8_t code = list.codes ? list.codes[at] : uint8_t{1};
-                    const float weight = query.weights[i] * code_weights_[code] * code_shares_[code] *
-                                         table[distances[static_cast<size_t>(j)]];
-                    const int64_t slot = first + list.ids[at];
-                    if (geometric)
-                        count_geometry(list.geometry[at], query.geometry[i], weight, total.values.get() + slot * kBins);
-                    else
-                        total.values[static_cast<size_t>(slot)] += weight;
-                }
-            }
-        }
-    });
-    if (!geometric) return finished(std::move(total), query.mass);
-    Scores scores = room(1);
-    for (int64_t slot = 0; slot < scores.n; ++slot) {
-        const float* bins = total.values.get() + slot * kBins;
-        scores.values[static_cast<size_t>(slot)] = std::min(*std::max_element(bins, bins + kOrientationBins),
-                                                            *std::max_element(bins + kOrientationBins, bins + kBins));
-    }
-    return finished(std::move(scores), query.mass);
-}
-
-Scores Postings::room(int64_t per_slot) const {
-    const size_t n = masses_.size();
-    auto* values = static_cast<float*>(std::calloc((n + kMostPlaces) * static_cast<size_t>(per_slot), sizeof(float)));
-    if (!values) throw std::bad_alloc();
-    return {std::unique_ptr<float[], Scores::Free>(values), static_cast<int64_t>(n)};
-}
-
-Scores Postings::finished(Scores scores, float mass) const {
-    float* values = scores.values.get();
-    mass = std::max(mass, std::numeric_limits<float>::min());
-    for (size_t slot = 0; slot < masses_.size(); ++slot) values[slot] /= std::max(mass, masses_[slot]);
-    return scores;
-}
-
-void Scores::Free::operator()(float* values) const { std::free(values); }
 
 Snapshot Postings::snapshot() const {
     const std::shared_lock reading(state_);

@@ -75,6 +75,20 @@ struct ListView {
     int64_t n;
 };
 
+// The lists of an immutable block.
+struct SealedLists {
+    const Block& block;
+    int64_t n_words;
+
+    ListView list(int64_t l) const {
+        const uint32_t start = block.starts[l];
+        return {block.ids + start, l >= n_words ? block.codes + (start - block.starts[n_words]) : nullptr,
+                block.signatures ? block.signatures + start : nullptr,
+                block.geometry ? block.geometry + start : nullptr, block.starts[l + 1] - start};
+    }
+    void prefetch_header(int64_t l) const { __builtin_prefetch(block.starts + l); }
+};
+
 // The block that grows: each list is an extent of a pool whose size is a power of two, moved when it is full.
 class Head {
 public:
@@ -135,7 +149,7 @@ public:
     std::vector<int32_t> compact();                    // forgets removed places; returns the old slot of each new one
 
     // Returns for each slot the sum over common words of weight times the lesser of both counts, as the codes weigh them,
-    // divided by the greater of both masses.
+    // divided by the greater of both masses, at most 1.
     Scores votes(const QueryView& query) const;
     // The same over pairs of postings, each weighed by the code and by table[Hamming distance of the signatures]; pairs
     // farther than `limit` count nothing. With `geometric`, orientation and scale must agree too: only the fullest bin of each of the
@@ -160,7 +174,7 @@ private:
     void visit_blocks(const QueryView& query, Each each) const;
     Block gather(int64_t first, int64_t n, const std::vector<int32_t>& rank, const std::vector<Block>& from) const;
     Block freeze_head() const;
-    Scores room(int64_t per_slot) const;
+    Scores room(int64_t per_slot) const;  // zeros
     Scores finished(Scores scores, float mass) const;
 
     const int64_t n_words_, block_places_;

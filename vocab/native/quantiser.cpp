@@ -13,7 +13,6 @@ namespace {
 constexpr int32_t kNever = std::numeric_limits<int32_t>::max() / 2;  // 2 sum w (d - 128) cannot overflow it
 constexpr int32_t kAnywhere = std::numeric_limits<int32_t>::max();
 constexpr int64_t kBatch = 16384;                                    // descriptors that are sorted by cell at a time
-constexpr int64_t kStretch = 16;  // groups searched by all descriptors before the next ones: 32 KiB, a first-level cache
 
 int32_t square(const uint8_t* descriptor) {
     int32_t sum = 0;
@@ -116,7 +115,7 @@ void Quantiser::assign_some(const uint8_t* descriptors, int64_t n, int k, int be
 void Quantiser::search(const Grouped& grouped, int64_t first_group, int64_t n_words, int32_t first_word,
                        const uint8_t* descriptors, const int32_t* which, int64_t n, int k, int32_t reach, Near* out,
                        std::vector<int32_t>& scratch) const {
-    constexpr int64_t kWidth = kStretch * kGroup;
+    constexpr int64_t kWidth = kMostGroups * kGroup;  // words that all descriptors are compared with before the next ones
     scratch.resize(static_cast<size_t>(kTile * kWidth));
     int32_t positions[kWidth + 16];
     for (int64_t from = 0; from < n_words; from += kWidth) {
@@ -126,20 +125,21 @@ void Quantiser::search(const Grouped& grouped, int64_t first_group, int64_t n_wo
             const int m = static_cast<int>(std::min<int64_t>(kTile, n - i));
             const uint8_t* tile[kTile];
             for (int j = 0; j < m; ++j) tile[j] = descriptors + static_cast<int64_t>(which[i + j]) * kDescriptorSize;
-            kernels_.distances(grouped.bytes(group), grouped.bias(group), (width + kGroup - 1) / kGroup, tile, m,
-                               scratch.data(), kWidth);
+            const int64_t n_groups = (width + kGroup - 1) / kGroup;
+            if (k == 1) {
+                int32_t value[kTile], at[kTile];
+                kernels_.nearest(grouped.bytes(group), grouped.bias(group), n_groups, tile, m, value, at);
+                for (int j = 0; j < m; ++j) insert({value[j], word + at[j]}, 1, out + which[i + j]);
+                continue;
+            }
+            kernels_.distances(grouped.bytes(group), grouped.bias(group), n_groups, tile, m, scratch.data(), kWidth);
             for (int j = 0; j < m; ++j) {
                 const int32_t* row = scratch.data() + j * kWidth;
                 Near* best = out + static_cast<int64_t>(which[i + j]) * k;
-                if (k == 1) {
-                    const auto at = static_cast<int32_t>(kernels_.smallest(row, width));
-                    insert({row[at], word + at}, 1, best);
-                } else {
-                    const int64_t farthest = int64_t{row[kernels_.smallest(row, width)]} + reach;
-                    const auto limit = static_cast<int32_t>(std::min<int64_t>(farthest, best[k - 1].distance));
-                    const int64_t found = kernels_.at_most(row, width, limit, positions);
-                    for (int64_t p = 0; p < found; ++p) insert({row[positions[p]], word + positions[p]}, k, best);
-                }
+                const int64_t farthest = int64_t{row[kernels_.smallest(row, width)]} + reach;
+                const auto limit = static_cast<int32_t>(std::min<int64_t>(farthest, best[k - 1].distance));
+                const int64_t found = kernels_.at_most(row, width, limit, positions);
+                for (int64_t p = 0; p < found; ++p) insert({row[positions[p]], word + positions[p]}, k, best);
             }
         }
     }
