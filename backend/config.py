@@ -23,6 +23,9 @@ class VerificationConfig(_Section):
     iterations: int = Field(default=2000, ge=100, description="most samples drawn")
     min_inliers: int = Field(default=15, ge=6, description="inliers of a pose below which it is refused")
     min_inlier_ratio: float = Field(default=0.15, ge=0, le=1, description="inliers of a pose per match with depth")
+    min_explained: float = Field(
+        default=0.5, ge=0, le=1, description="share of the matches without depth that a pose must explain"
+    )
     min_epipolar_inliers: int = Field(
         default=20, ge=9, description="inliers of epipolar geometry below which it is refused"
     )
@@ -34,16 +37,23 @@ class VerificationConfig(_Section):
         default=4, ge=1, description="cells of an 8 x 6 grid over the image that inliers must occupy"
     )
     noise_px: float = Field(
-        default=1.0, gt=0, description="least standard deviation of a key point assumed for covariances"
+        default=0.5, gt=0, description="expected standard deviation of a key point; the matches themselves correct it"
     )
-    covariance_inflation: float = Field(
-        default=4.0, ge=1, description="factor on a pose's covariance: landmarks err too"
+    shared_px: float = Field(
+        default=0.1, ge=0, description="part of it that key points of one cell of an 8 x 6 grid have in common"
     )
-    rotation_floor_deg: float = Field(
-        default=0.3, gt=0, description="least sigma of a loop's rotation: rolling shutters and calibrations err too"
+    shared_depth: float = Field(
+        default=0.3, ge=0, description="the same of inverse depths, as a share of their standard deviation"
     )
+    rotation_floor_deg: float = Field(default=0.005, gt=0, description="least standard deviation of a loop's rotation")
     translation_floor_fraction: float = Field(
-        default=0.01, gt=0, description="least standard deviation of a loop's translation per median depth"
+        default=0.0002, gt=0, description="least standard deviation of a loop's translation per median depth"
+    )
+    rotation_systematic: float = Field(
+        default=0.0005, ge=0, description="standard deviation of a loop's rotation per angle between the views"
+    )
+    translation_systematic: float = Field(
+        default=0.002, ge=0, description="standard deviation of a loop's translation per distance between the views"
     )
     locate_inliers: int = Field(default=25, ge=6, description="inliers from which a single image is localised")
     min_scale_pairs: int = Field(

@@ -16,6 +16,7 @@ class Reason(StrEnum):
     FEW_MATCHES = "few_matches"  # too few descriptor matches to try geometry
     FEW_INLIERS = "few_inliers"  # geometry explains too few of them
     BAD_GEOMETRY = "bad_geometry"  # degenerate, or inliers crowd in one spot
+    CONTRADICTED = "contradicted"  # the pose leaves unexplained what else matches, or what should be seen is missing
     ODOMETRY_DISAGREES = "odometry_disagrees"  # contradicts the odometry's own uncertainty
     INCONSISTENT = "inconsistent"  # contradicts other loops
     UNCONFIRMED = "unconfirmed"  # plausible, but no second loop supports it

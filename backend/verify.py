@@ -1,6 +1,6 @@
 """Geometric verification: do two keyframes show the same place, and how do their cameras lie to each other?"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import cv2
@@ -8,12 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
+from seamark.backend.evidence import Evidence, Gate
 from seamark.backend.matching import Matches, match_features
+from seamark.backend.refine_pose import Observations, RefinedPose, explained_without_depth, refine
 from seamark.backend.types import Reason
-from seamark.backend.verify_pose import RelativePose, estimate_pose, estimate_scale, pose_covariance, usac_parameters
+from seamark.backend.verify_pose import Hypothesis, estimate_pose, estimate_scale, usac_parameters
+from seamark.backend.visibility import Sight, look
+from seamark.frontend import se3
 from seamark.frontend.types import Keyframe
 
 Matrix = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 SPREAD_CELLS = (8, 6)
 
@@ -33,6 +38,7 @@ class Verification:
     covariance: Matrix | None = None
     scale: float = 1.0
     scale_sigma: float = 1e-3
+    evidence: Evidence | None = None
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,7 @@ class Rejected:
     reason: Reason
     inliers: int
     matches: int
+    evidence: Evidence | None = field(default=None, compare=False)
 
 
 def verify(query: Keyframe, match: Keyframe, config: VerificationConfig, seed: int) -> Verification | Rejected:
@@ -51,73 +58,149 @@ def verify(query: Keyframe, match: Keyframe, config: VerificationConfig, seed: i
     fundamental matrix; these tell the place and no metric pose. The same input and ``seed`` give the same result.
     """
     matches = match_features(query.features, match.features, config.match_ratio)
-    if len(matches) < config.min_matches:
-        return Rejected(Reason.FEW_MATCHES, 0, len(matches))
+    trial = _Trial(query, match, matches, config)
+    if not trial.passes("matches", len(matches), config.min_matches):
+        return trial.rejected(Reason.FEW_MATCHES)
     if query.camera is None or match.camera is None:
-        return _verify_epipolar(query, match, matches, config, seed)
+        return _verify_epipolar(trial, seed)
     depth_pairs = max(
         np.isfinite(_landmarks(match)[matches.match]).all(1).sum(),
         np.isfinite(_landmarks(query)[matches.query]).all(1).sum(),
     )
     if depth_pairs < config.min_inliers:
-        return _verify_epipolar(query, match, matches, config, seed)
-    return _verify_pose(query, match, matches, config, seed)
+        return _verify_epipolar(trial, seed)
+    return _verify_pose(trial, seed)
 
 
-def _verify_pose(
-    query: Keyframe, match: Keyframe, matches: Matches, config: VerificationConfig, seed: int
-) -> Verification | Rejected:
-    """Estimate the pose from either side's landmarks and keep the better one."""
-    best = _best_pose(query, match, matches, config, seed)
+class _Trial:
+    """One comparison on its way through the gates."""
+
+    def __init__(self, query: Keyframe, match: Keyframe, matches: Matches, config: VerificationConfig) -> None:
+        self.query, self.match, self.matches, self.config = query, match, matches, config
+        self.inliers: Flags = np.zeros(len(matches), bool)
+        self.explained: Flags = np.zeros(len(matches), bool)  # without depth
+        self.reprojection_px = float("nan")
+        self.missing = np.zeros((0, 2), np.float32)
+        self._gates: list[Gate] = []
+
+    @property
+    def count(self) -> int:
+        return int(self.inliers.sum())
+
+    def passes(self, name: str, value: float, limit: float, least: bool = True) -> bool:
+        """Write down a gate and return whether it lets the candidate through."""
+        self._gates.append(Gate(name, float(value), float(limit), least))
+        return self._gates[-1].passed
+
+    def evidence(self) -> Evidence:
+        pixels = np.hstack(
+            [self.query.features.points[self.matches.query], self.match.features.points[self.matches.match]]
+        )
+        return Evidence(pixels, self.inliers | self.explained, tuple(self._gates), self.reprojection_px, self.missing)
+
+    def rejected(self, reason: Reason) -> Rejected:
+        return Rejected(reason, self.count, len(self.matches), self.evidence())
+
+
+def _verify_pose(trial: _Trial, seed: int) -> Verification | Rejected:
+    """Estimate the pose from either side's landmarks, refine the better one with both, and look whether it holds."""
+    query, match, config = trial.query, trial.match, trial.config
+    best = _best_hypothesis(trial, seed)
     if best is None:
-        return Rejected(Reason.FEW_INLIERS, 0, len(matches))
-    count = int(best.inliers.sum())
-    if count < config.min_inliers or count < config.min_inlier_ratio * best.pairs:
-        return Rejected(Reason.FEW_INLIERS, count, len(matches))
-    if not _well_spread(query, match, matches, best.inliers, config):
-        return Rejected(Reason.BAD_GEOMETRY, count, len(matches))
-    T_match_query, scale, scale_sigma = best.T_match_query, 1.0, 1e-3
-    if not (query.metric and match.metric):
+        trial.passes("inliers", 0, config.min_inliers)
+        return trial.rejected(Reason.FEW_INLIERS)
+    metric = query.metric and match.metric
+    seen = _observations(trial, best, metric)
+    refined = refine(best.T_match_query, seen, config)
+    trial.inliers = best.inliers if refined is None else refined.inliers
+    if not trial.passes("inliers", trial.count, config.min_inliers):
+        return trial.rejected(Reason.FEW_INLIERS)
+    if not trial.passes("inlier_ratio", trial.count / max(best.pairs, 1), config.min_inlier_ratio):
+        return trial.rejected(Reason.FEW_INLIERS)
+    if not _well_spread(trial) or refined is None:
+        return trial.rejected(Reason.BAD_GEOMETRY)
+    trial.reprojection_px = refined.reprojection_px
+    explained, others = explained_without_depth(refined.T_match_query, seen, config.reprojection_px)
+    trial.explained = explained
+    # Smoothed, so that one or two matches decide nothing.
+    if not trial.passes("explained_without_depth", (explained.sum() + 2) / (others.sum() + 2), config.min_explained):
+        return trial.rejected(Reason.CONTRADICTED)
+    sight = _look(trial, refined, best.in_query_units)
+    trial.missing = sight.pixels[sight.found < 0].astype(np.float32) if not best.in_query_units else trial.missing
+    trial.passes("confirmed", sight.confirmed / max(sight.expected, 1), 0.0)
+    T_match_query, covariance, scale, scale_sigma = refined.T_match_query, refined.covariance.copy(), 1.0, 1e-3
+    if not metric:
+        X_query, X_match = _landmarks(query)[trial.matches.query], _landmarks(match)[trial.matches.match]
         scale, scale_sigma = estimate_scale(
-            best, _landmarks(query)[matches.query], _landmarks(match)[matches.match], config.min_scale_pairs
+            T_match_query, best.in_query_units, trial.inliers, X_query, X_match, config.min_scale_pairs
         )
         if best.in_query_units and np.isfinite(scale_sigma):
             T_match_query = T_match_query.copy()
             T_match_query[:3, 3] *= scale
         elif best.in_query_units:
-            return Rejected(Reason.BAD_GEOMETRY, count, len(matches))
-    covariance = pose_covariance(best, config)
-    if covariance is None:
-        return Rejected(Reason.BAD_GEOMETRY, count, len(matches))
-    if not best.in_query_units:
-        # A tangent vector of the query's frame is in the query's units.
-        covariance[3:, :] /= scale
-        covariance[:, 3:] /= scale
-    return Verification(count, len(matches), T_match_query, covariance, scale, scale_sigma)
+            return trial.rejected(Reason.BAD_GEOMETRY)
+        else:
+            # A tangent vector of the query's frame is in the query's units.
+            covariance[3:, :] /= scale
+            covariance[:, 3:] /= scale
+    return Verification(
+        trial.count, len(trial.matches), T_match_query, covariance, scale, scale_sigma, trial.evidence()
+    )
 
 
-def _best_pose(
-    query: Keyframe, match: Keyframe, matches: Matches, config: VerificationConfig, seed: int
-) -> RelativePose | None:
+def _best_hypothesis(trial: _Trial, seed: int) -> Hypothesis | None:
     """Estimate the pose with the match's and with the query's landmarks; more inliers win, the match's on a tie."""
+    query, match, config = trial.query, trial.match, trial.config
     assert query.camera is not None and match.camera is not None
-    poses = []
-    X_match = _landmarks(match)[matches.match]
-    uv_query = query.camera.undistort(query.features.points[matches.query])
-    poses.append(estimate_pose(X_match, uv_query, query.camera, config, seed, in_query_units=False))
-    X_query = _landmarks(query)[matches.query]
-    uv_match = match.camera.undistort(match.features.points[matches.match])
+    X_match = _landmarks(match)[trial.matches.match]
+    uv_query = query.camera.undistort(query.features.points[trial.matches.query])
+    poses = [estimate_pose(X_match, uv_query, query.camera, config, seed, in_query_units=False)]
+    X_query = _landmarks(query)[trial.matches.query]
+    uv_match = match.camera.undistort(match.features.points[trial.matches.match])
     poses.append(estimate_pose(X_query, uv_match, match.camera, config, seed, in_query_units=True))
     found = [pose for pose in poses if pose is not None]
     return max(found, key=lambda pose: int(pose.inliers.sum()), default=None)
 
 
-def _verify_epipolar(
-    query: Keyframe, match: Keyframe, matches: Matches, config: VerificationConfig, seed: int
-) -> Verification | Rejected:
+def _observations(trial: _Trial, best: Hypothesis, metric: bool) -> Observations:
+    """Return what both sides have measured; without a common unit only the landmarks that the pose came from."""
+    query, match = trial.query, trial.match
+    assert query.camera is not None and match.camera is not None
+    X_query, X_match = _landmarks(query)[trial.matches.query], _landmarks(match)[trial.matches.match]
+    if not metric and best.in_query_units:
+        X_match = np.full_like(X_match, np.nan)
+    elif not metric:
+        X_query = np.full_like(X_query, np.nan)
+    return Observations(
+        X_query,
+        X_match,
+        query.camera.undistort(query.features.points[trial.matches.query]),
+        match.camera.undistort(match.features.points[trial.matches.match]),
+        query.camera,
+        match.camera,
+    )
+
+
+def _look(trial: _Trial, refined: RefinedPose, in_query_units: bool) -> Sight:
+    """Look in one view for the landmarks of the other that the pose was found from."""
+    owner, viewer = (trial.query, trial.match) if in_query_units else (trial.match, trial.query)
+    assert owner.camera is not None and viewer.camera is not None
+    T = refined.T_match_query if in_query_units else se3.inverse(refined.T_match_query)
+    rows, columns = trial.matches.query[trial.inliers], trial.matches.match[trial.inliers]
+    difference = trial.query.features.descriptors[rows].astype(np.float32)
+    difference -= trial.match.features.descriptors[columns].astype(np.float32)
+    reach = 1.5 * float(np.median(np.linalg.norm(difference, axis=1)))
+    measured = _landmarks(viewer)
+    if not (owner.metric and viewer.metric):
+        measured = np.full_like(measured, np.nan)
+    return look(T, owner.features, _landmarks(owner), owner.camera, viewer.features, measured, viewer.camera, reach)
+
+
+def _verify_epipolar(trial: _Trial, seed: int) -> Verification | Rejected:
     """Fit the essential (calibrated) or fundamental matrix and count what it explains; there is no metric pose."""
-    points_query = query.features.points[matches.query].astype(np.float64)
-    points_match = match.features.points[matches.match].astype(np.float64)
+    query, match, config = trial.query, trial.match, trial.config
+    points_query = query.features.points[trial.matches.query].astype(np.float64)
+    points_match = match.features.points[trial.matches.match].astype(np.float64)
     parameters = usac_parameters(config.epipolar_px, config, seed)
     if query.camera is not None and match.camera is not None:
         points_query, points_match = query.camera.undistort(points_query), match.camera.undistort(points_match)
@@ -131,22 +214,24 @@ def _verify_epipolar(
         # OpenCV 5.0 asserts when its last refinement degenerates, as it does for two almost equal images.
         limits = (config.epipolar_px, config.confidence, config.iterations)
         model, mask = cv2.findFundamentalMat(points_query, points_match, cv2.FM_RANSAC, *limits)
-    if model is None or mask is None or model.shape != (3, 3) or not np.isfinite(model).all():
-        return Rejected(Reason.FEW_INLIERS, 0, len(matches))
-    inliers = mask.reshape(-1).astype(bool)
-    count = int(inliers.sum())
-    if count < config.min_epipolar_inliers or count < config.min_epipolar_ratio * len(matches):
-        return Rejected(Reason.FEW_INLIERS, count, len(matches))
-    if not _well_spread(query, match, matches, inliers, config):
-        return Rejected(Reason.BAD_GEOMETRY, count, len(matches))
-    return Verification(count, len(matches), scale_sigma=float("inf"))
+    if model is not None and mask is not None and model.shape == (3, 3) and np.isfinite(model).all():
+        trial.inliers = mask.reshape(-1).astype(bool)
+    if not trial.passes("epipolar_inliers", trial.count, config.min_epipolar_inliers):
+        return trial.rejected(Reason.FEW_INLIERS)
+    if not trial.passes("epipolar_ratio", trial.count / len(trial.matches), config.min_epipolar_ratio):
+        return trial.rejected(Reason.FEW_INLIERS)
+    if not _well_spread(trial):
+        return trial.rejected(Reason.BAD_GEOMETRY)
+    return Verification(trial.count, len(trial.matches), scale_sigma=float("inf"), evidence=trial.evidence())
 
 
-def _well_spread(
-    query: Keyframe, match: Keyframe, matches: Matches, inliers: NDArray[np.bool_], config: VerificationConfig
-) -> bool:
+def _well_spread(trial: _Trial) -> bool:
     """Return whether the inliers neither crowd in one spot nor lie on a line, in both images."""
-    for keyframe, indices in ((query, matches.query[inliers]), (match, matches.match[inliers])):
+    sides = (
+        ("query", trial.query, trial.matches.query[trial.inliers]),
+        ("match", trial.match, trial.matches.match[trial.inliers]),
+    )
+    for name, keyframe, indices in sides:
         points = keyframe.features.points
         size = np.ptp(points, axis=0).astype(np.float64) + 1.0
         origin = points.min(axis=0).astype(np.float64)
@@ -154,10 +239,11 @@ def _well_spread(
             size, origin = np.array([keyframe.camera.width, keyframe.camera.height], np.float64), np.zeros(2)
         seen = points[indices]
         cells = np.clip((seen - origin) / size * SPREAD_CELLS, 0, np.array(SPREAD_CELLS) - 1).astype(np.int64)
-        if len(np.unique(cells, axis=0)) < config.min_cells:
+        if not trial.passes(f"cells_{name}", len(np.unique(cells, axis=0)), trial.config.min_cells):
             return False
         hull = cv2.convexHull(np.ascontiguousarray(seen, np.float32))
-        if cv2.contourArea(hull) < config.min_hull_fraction * size[0] * size[1]:
+        share = cv2.contourArea(hull) / (size[0] * size[1])
+        if not trial.passes(f"hull_{name}", share, trial.config.min_hull_fraction):
             return False
     return True
 
