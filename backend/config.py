@@ -26,6 +26,12 @@ class VerificationConfig(_Section):
     min_explained: float = Field(
         default=0.5, ge=0, le=1, description="share of the matches without depth that a pose must explain"
     )
+    max_rotation_sigma_deg: float = Field(
+        default=2.0, gt=0, description="deviation of a pose's rotation, in its worst direction, that is refused"
+    )
+    max_translation_sigma_fraction: float = Field(
+        default=0.05, gt=0, description="the same of its translation, per median depth of what is seen"
+    )
     min_epipolar_inliers: int = Field(
         default=20, ge=9, description="inliers of epipolar geometry below which it is refused"
     )

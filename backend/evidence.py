@@ -69,12 +69,12 @@ def decode_evidence(blob: bytes) -> Evidence:
         if facts["version"] != VERSION:
             raise MapCorruptError(f"evidence of version {facts['version']}; this program knows {VERSION}")
         matches, missing = int(facts["matches"]), int(facts["missing"])
-        ends = np.cumsum([8 * matches, (matches + 7) // 8, 4 * missing])
+        ends = np.cumsum([16 * matches, (matches + 7) // 8, 8 * missing])
         if len(body) != ends[-1]:
             raise ValueError("length")
-        pixels = np.frombuffer(body[: ends[0]], "<u2").reshape(-1, 4).astype(np.float32) / np.float32(8)
+        pixels = np.frombuffer(body[: ends[0]], "<i4").reshape(-1, 4).astype(np.float32) / np.float32(8)
         inliers = np.unpackbits(np.frombuffer(body[ends[0] : ends[1]], np.uint8), count=matches).astype(bool)
-        absent = np.frombuffer(body[ends[1] :], "<u2").reshape(-1, 2).astype(np.float32) / np.float32(8)
+        absent = np.frombuffer(body[ends[1] :], "<i4").reshape(-1, 2).astype(np.float32) / np.float32(8)
         gates = tuple(
             Gate(str(name), float(value), float(limit), bool(least)) for name, value, limit, least in facts["gates"]
         )
@@ -83,5 +83,5 @@ def decode_evidence(blob: bytes) -> Evidence:
         raise MapCorruptError(f"the evidence of a loop is damaged: {error}") from error
 
 
-def _fixed_point(pixels: NDArray[np.float32]) -> NDArray[np.uint16]:
-    return np.clip(np.rint(8 * pixels), 0, 65535).astype("<u2")
+def _fixed_point(pixels: NDArray[np.float32]) -> NDArray[np.int32]:
+    return np.rint(8 * np.clip(pixels, -1e8, 1e8)).astype("<i4")

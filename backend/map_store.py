@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.errors import MapCorruptError, MapError
+from seamark.backend.evidence import Evidence, decode_evidence, encode_evidence
 from seamark.backend.map_codec import (
     check_row,
     decode_array,
@@ -125,15 +126,10 @@ class MapStore:
         """Write loops' rows in one transaction, replacing earlier verdicts on the same pairs."""
         self.record(loops)
 
-    def add_evidence(self, query_id: int, match_id: int, content: bytes) -> None:
-        """Write what a loop rests on; the loop must be there. The content's form is the caller's."""
-        with self.file.writing() as database:
-            database.execute(upsert("evidence"), sealed("evidence", (int(query_id), int(match_id), content)))
-
-    def evidence(self, query_id: int, match_id: int) -> bytes | None:
+    def evidence(self, query_id: int, match_id: int) -> Evidence | None:
         """Return what a loop rests on, None when nothing was kept."""
         rows = self._rows("evidence", "query_id = ? AND match_id = ?", (int(query_id), int(match_id)))
-        return rows[0]["content"] if rows else None
+        return decode_evidence(rows[0]["content"]) if rows else None
 
     def history(self, query_id: int, match_id: int) -> tuple[Verdict, ...]:
         """Return all verdicts on a loop, the oldest first."""
@@ -266,6 +262,8 @@ class MapStore:
             condition = "SELECT accepted, reason FROM loops WHERE query_id = ? AND match_id = ?"
             before = database.execute(condition, key).fetchone()
             database.execute(upsert("loops"), sealed("loops", encode_loop(loop)))
+            if loop.evidence is not None:
+                database.execute(upsert("evidence"), sealed("evidence", (*key, encode_evidence(loop.evidence))))
             verdict = (int(loop.accepted), loop.reason.value)
             if before is None or tuple(before) != verdict:
                 count, newest, revision = database.execute(

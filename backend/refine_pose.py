@@ -50,7 +50,8 @@ class RefinedPose:
     """``T_match_query`` with its ``covariance`` (6, 6) in the query's tangent space, and what it rests on.
 
     ``inliers`` (M,) of all matches, ``reprojection_px`` their median error, ``depth_pairs`` how many inliers have a
-    depth on both sides, ``depth_sigma`` the noise of inverse depth that was assumed or measured.
+    depth on both sides, ``depth_sigma`` the noise of inverse depth that was assumed or measured, ``depth`` the median
+    depth of the inliers.
     """
 
     T_match_query: Matrix
@@ -59,6 +60,7 @@ class RefinedPose:
     reprojection_px: float
     depth_pairs: int
     depth_sigma: float
+    depth: float
 
 
 def refine(T_match_query: Matrix, seen: Observations, config: VerificationConfig) -> RefinedPose | None:
@@ -94,7 +96,7 @@ def refine(T_match_query: Matrix, seen: Observations, config: VerificationConfig
     both = np.isfinite(seen.X_query).all(axis=1) & np.isfinite(seen.X_match).all(axis=1)
     middle = float(np.median(errors(T, seen)[inliers]))
     covariance = 0.5 * (covariance + covariance.T)
-    return RefinedPose(T, covariance, inliers, middle, int((both & inliers).sum()), sigma)
+    return RefinedPose(T, covariance, inliers, middle, int((both & inliers).sum()), sigma, float(scaling[3]))
 
 
 def errors(T_match_query: Matrix, seen: Observations) -> NDArray[np.float64]:
@@ -120,7 +122,8 @@ def explained_without_depth(T_match_query: Matrix, seen: Observations, limit_px:
 
     A pose that a repeated pattern nearby has brought forth leaves what stands farther away unexplained.
     """
-    without: Flags = ~(np.isfinite(seen.X_query).all(axis=1) | np.isfinite(seen.X_match).all(axis=1))
+    known = np.isfinite(seen.X_query).all(axis=1) | np.isfinite(seen.X_match).all(axis=1)
+    without: Flags = np.asarray(~known)
     R, t = T_match_query[:3, :3], T_match_query[:3, 3]
     near = np.concatenate([X[np.isfinite(X[:, 2]), 2] for X in (seen.X_query, seen.X_match)])
     closest = NEAREST * float(np.median(near)) if len(near) else 1.0

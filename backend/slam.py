@@ -81,7 +81,9 @@ class Slam:
         started = time.perf_counter()
         optimised = self._commit([key for key in changed if self._loops[key].accepted != (key in self._committed)])
         timings_ms["optimise"] = 1e3 * (time.perf_counter() - started)
-        return StepResult(tuple(self._loops[key] for key in changed), self._map.revision, optimised, timings_ms)
+        evidence = {(keyframe.id, candidate.id): result.evidence for candidate, result in verified}
+        loops = tuple(replace(self._loops[key], evidence=evidence.get(key)) for key in changed)
+        return StepResult(loops, self._map.revision, optimised, timings_ms)
 
     def finish(self) -> StepResult:
         """Solve thoroughly; loops that still wait for confirmation keep their verdict UNCONFIRMED, not accepted."""

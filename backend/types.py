@@ -6,6 +6,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.evidence import Evidence
+
 Matrix = NDArray[np.float64]
 
 
@@ -28,7 +30,8 @@ class Loop:
 
     ``T_match_query`` (4, 4) maps the query camera's frame into the matched camera's; None where geometry gave none
     (rejected early, or mode places). For mono sessions its translation is in the scale of the match's session.
-    ``covariance`` (6, 6) is in the query's frame. ``score votes jeffrey`` are the candidate's evidence.
+    ``covariance`` (6, 6) is in the query's frame. ``score votes jeffrey`` are the candidate's evidence, ``evidence`` is
+    that of geometry: only when the loop is first told of, afterwards the map on disk has it.
     """
 
     query_id: int
@@ -42,6 +45,7 @@ class Loop:
     T_match_query: Matrix | None = None
     covariance: Matrix | None = None
     scale: float = 1.0
+    evidence: Evidence | None = None
 
 
 @dataclass(frozen=True, eq=False)

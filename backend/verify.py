@@ -21,6 +21,7 @@ Matrix = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 SPREAD_CELLS = (8, 6)
+CLOSE_DESCRIPTORS = 60.0  # of 512: two that differ by less are of one thing, however alike the other matches are
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +121,8 @@ def _verify_pose(trial: _Trial, seed: int) -> Verification | Rejected:
     if not _well_spread(trial) or refined is None:
         return trial.rejected(Reason.BAD_GEOMETRY)
     trial.reprojection_px = refined.reprojection_px
+    if not _well_held(trial, refined):
+        return trial.rejected(Reason.BAD_GEOMETRY)
     explained, others = explained_without_depth(refined.T_match_query, seen, config.reprojection_px)
     trial.explained = explained
     # Smoothed, so that one or two matches decide nothing.
@@ -145,6 +148,19 @@ def _verify_pose(trial: _Trial, seed: int) -> Verification | Rejected:
             covariance[:, 3:] /= scale
     return Verification(
         trial.count, len(trial.matches), T_match_query, covariance, scale, scale_sigma, trial.evidence()
+    )
+
+
+def _well_held(trial: _Trial, refined: RefinedPose) -> bool:
+    """Return whether the matches hold the pose: a few far ones in a corner leave it free to swing about them."""
+    rotation, translation = (
+        float(np.sqrt(np.linalg.eigvalsh(refined.covariance[part, part])[-1])) for part in (slice(3), slice(3, 6))
+    )
+    config = trial.config
+    return trial.passes(
+        "rotation_sigma_deg", np.rad2deg(rotation), config.max_rotation_sigma_deg, least=False
+    ) and trial.passes(
+        "translation_sigma_per_depth", translation / refined.depth, config.max_translation_sigma_fraction, least=False
     )
 
 
@@ -189,7 +205,7 @@ def _look(trial: _Trial, refined: RefinedPose, in_query_units: bool) -> Sight:
     rows, columns = trial.matches.query[trial.inliers], trial.matches.match[trial.inliers]
     difference = trial.query.features.descriptors[rows].astype(np.float32)
     difference -= trial.match.features.descriptors[columns].astype(np.float32)
-    reach = 1.5 * float(np.median(np.linalg.norm(difference, axis=1)))
+    reach = max(1.5 * float(np.median(np.linalg.norm(difference, axis=1))), CLOSE_DESCRIPTORS)
     measured = _landmarks(viewer)
     if not (owner.metric and viewer.metric):
         measured = np.full_like(measured, np.nan)

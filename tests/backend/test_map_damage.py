@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from seamark.backend.errors import MapError
+from seamark.backend.evidence import Evidence, Gate
 from seamark.backend.map_carve import carve
 from seamark.backend.map_check import check_map
 from seamark.backend.map_repair import repair_map
@@ -43,11 +44,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory, template: Keyframe) -> Path:
             store.add_keyframe(
                 replace(template, id=number, session=session, previous_id=previous, T_odom_cam=T, jpeg=jpeg)
             )
+        seen = Evidence(np.ones((80, 4), np.float32), np.ones(80, bool), (Gate("inliers", 80, 15),))
         store.add_loops(
-            Loop(30 + n, n, True, Reason.ACCEPTED, 80, 1.0, 0.25, 0.125, np.eye(4), np.eye(6)) for n in range(20)
+            Loop(30 + n, n, True, Reason.ACCEPTED, 80, 1.0, 0.25, 0.125, np.eye(4), np.eye(6)) for n in range(1, 20)
         )
+        store.add_loop(Loop(30, 0, True, Reason.ACCEPTED, 80, 1.0, 0.25, 0.125, np.eye(4), np.eye(6), evidence=seen))
         store.add_loop(Loop(31, 1, False, Reason.INCONSISTENT, 80, 1.0, 0.25, 0.125, np.eye(4), np.eye(6)))
-        store.add_evidence(30, 0, b"what it rests on")
         ids = np.arange(COUNT)
         T_map = np.tile(np.eye(4), (COUNT, 1, 1))
         T_map[:, 0, 3] = ids
