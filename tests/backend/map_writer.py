@@ -21,7 +21,8 @@ from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
 from seamark.frontend.types import Features, Keyframe
 
-LONGEST_LIFE_NUMBERS = 4  # in the time that one number takes on this disk
+LONGEST_WAIT_NUMBERS = 1.5  # in the time that one number takes on this disk
+MOST_LINES = 3  # before the wait begins
 FORGET_AFTER = 20
 
 
@@ -73,8 +74,8 @@ def write(path: Path, acknowledge: int) -> None:
         number += 1
 
 
-def life(path: Path, delay_s: float, once_open: bool) -> dict[str, object]:
-    """Fork a writer, kill it some time after its birth or after it has the map open; return what it acknowledged."""
+def life(path: Path, delay_s: float, lines: int) -> dict[str, object]:
+    """Fork a writer, kill it some time after it has said so many lines; return what it had acknowledged."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -84,15 +85,17 @@ def life(path: Path, delay_s: float, once_open: bool) -> dict[str, object]:
         finally:
             os._exit(1)
     os.close(writer)
-    seen = os.read(reader, 5) if once_open else b""
+    said = b""
+    while said.count(b"\n") < lines:
+        said += os.read(reader, 64)
     time.sleep(delay_s)
     os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     with os.fdopen(reader) as stream:
-        lines = (seen.decode() + stream.read()).split()
+        words = (said.decode() + stream.read()).split()
     return {
-        "open": "open" in lines,
-        "numbers": [int(line) for line in lines if line != "open"],
+        "open": "open" in words,
+        "numbers": [int(word) for word in words if word != "open"],
         "killed": os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL,
     }
 
@@ -118,9 +121,9 @@ def time_per_number_s(path: Path) -> float:
 def main() -> None:
     path, rng = Path(sys.argv[1]), random.Random(int(sys.argv[2]))
     with tempfile.TemporaryDirectory() as folder:
-        longest_s = LONGEST_LIFE_NUMBERS * time_per_number_s(Path(folder) / "trial.seamark")
+        longest_s = LONGEST_WAIT_NUMBERS * time_per_number_s(Path(folder) / "trial.seamark")
     for _ in sys.stdin:
-        print(json.dumps(life(path, rng.uniform(0, longest_s), rng.random() < 0.8)), flush=True)  # noqa: T201
+        print(json.dumps(life(path, rng.uniform(0, longest_s), rng.randint(0, MOST_LINES))), flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":
