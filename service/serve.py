@@ -54,6 +54,7 @@ def settings_for(options: ServeOptions, config: SeamarkConfig) -> NodeSettings:
         no_loops=not options.loops,
         endpoint=options.connect or "",
         namespace=options.namespace,
+        patient=True,
     )
 
 

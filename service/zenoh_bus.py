@@ -83,6 +83,12 @@ class ZenohBus:
         payload = encode(message)
         return all_done([self._outbox(topic, reader).send(payload) for reader in topic.readers])
 
+    def wait_for_room(self, topic: Topic, timeout_s: float) -> bool:
+        """Return whether all readers' windows have room; see :meth:`seamark.service.bus.Bus.wait_for_room`."""
+        check_kind(topic, Kind.ACKED)
+        deadline = time.monotonic() + timeout_s
+        return all(self._outbox(topic, reader).wait_for_room(deadline) for reader in topic.readers)
+
     def publish(self, topic: Topic, message: object) -> None:
         """Publish on a stream; never waits for readers."""
         check_kind(topic, Kind.STREAM)

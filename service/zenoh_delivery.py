@@ -1,10 +1,10 @@
 """Acknowledged delivery over Zenoh queries: in order, once, also across a restart of the reader.
 
 The sender numbers its messages and keeps those without acknowledgement. A message is a query; the reply is the
-acknowledgement. When a query ends without one (the reader died, refused or was not there), the sender goes back to the
-first unacknowledged message and sends all from there again (go-back-N). The reader handles number n only after n - 1,
-acknowledges what it has already handled without handling it again, and refuses gaps. A reader that has never heard of
-the sender starts at its ``base``, the lowest number without acknowledgement.
+acknowledgement. When a query ends without one (the reader died, refused or was not there) or the reader is BUSY, the
+sender goes back to the first unacknowledged message and sends all from there again (go-back-N). The reader handles
+number n only after n - 1, acknowledges what it has already handled without handling it again, and refuses gaps. A
+reader that has never heard of the sender starts at its ``base``, the lowest number without acknowledgement.
 """
 
 import contextlib
@@ -127,6 +127,13 @@ class Outbox:
             self._next_number += 1
             self._events.put(lambda: self._items.append(item))
         return item.done
+
+    def wait_for_room(self, deadline: float) -> bool:
+        """Wait until the window has room, at most until ``deadline`` (time.monotonic); return whether it has."""
+        with self._room:
+            return self._room.wait_for(
+                lambda: self._outstanding < self._window or self._closed, max(0.0, deadline - time.monotonic())
+            )
 
     def reader_changed(self, came: bool) -> None:
         """Take note that the reader has died, or is there again and need not be waited for any longer."""
@@ -283,7 +290,10 @@ class Reader:
                 self._advance(sender, number)
                 return
             except Exception as error:
-                refuse(query, error_reply(error))
+                refusal_of = error_reply(error)
+                if refusal_of.code == ErrorCode.BUSY:  # not now: the sender keeps it and sends it again
+                    self._advance(sender, number)
+                refuse(query, refusal_of)
                 return
             if done is not None:
                 self._pending[sender, number] = done

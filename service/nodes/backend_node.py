@@ -3,9 +3,10 @@
 import sys
 import threading
 from concurrent.futures import Future
+from pathlib import Path
 
 from seamark import __version__
-from seamark.backend.errors import MapError
+from seamark.backend.errors import MapError, MapUnwritableError
 from seamark.backend.graph_types import Solver
 from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam, StepResult
@@ -17,6 +18,7 @@ from seamark.frontend.types import Keyframe, Mode
 from seamark.service import topics
 from seamark.service.bus import Bus
 from seamark.service.config import config_hash
+from seamark.service.nodes.map_keeper import MAPPED, MapKeeper
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
 from seamark.service.nodes.process import run_process
@@ -25,7 +27,6 @@ from seamark.service.requests import Done
 from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
-MAPPED = "mapped"  # in the map's meta: the id of the last keyframe whose candidates have been seen to
 
 
 class BackendNode:
@@ -33,6 +34,7 @@ class BackendNode:
 
     A keyframe is acknowledged when it is on disk, candidates when their keyframe has been mapped. With ``no_loops``
     candidates are ignored. What ``store`` holds already is taken in first. ``solver`` is closed with the node.
+    ``patient``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`.
     """
 
     def __init__(
@@ -45,9 +47,11 @@ class BackendNode:
         *,
         no_loops: bool = False,
         solver: Solver | None = None,
+        patient: bool = False,
     ) -> None:
-        self._bus, self._slam, self._store, self._no_loops, self._solver = bus, slam, store, no_loops, solver
+        self._bus, self._slam, self._no_loops, self._solver = bus, slam, no_loops, solver
         self._meter = Meter(bus.node)
+        self._keeper = None if store is None else MapKeeper(store, self._meter, patient=patient)
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
         self._known: set[int] = set()
@@ -77,14 +81,14 @@ class BackendNode:
             with self._meter.timed("finish"):
                 result = self._slam.finish()
             self._tell(result)
-            if self._store is not None:
-                self._store.update_poses(self._slam.snapshot())
+            if self._keeper is not None and not result.optimised:
+                self._keeper.save(snapshot=self._slam.snapshot())
             self._settled = True
 
     def close(self) -> None:
         """Close the map's file and end the solver."""
-        if self._store is not None:
-            self._store.close()
+        if self._keeper is not None:
+            self._keeper.close()
         if self._solver is not None:
             self._solver.close()
 
@@ -115,10 +119,10 @@ class BackendNode:
             if keyframe.id in self._known:
                 self._meter.count("keyframes_again")
                 return
-            if self._store is not None:
+            if self._keeper is not None:
                 try:
                     with self._meter.timed("store"):
-                        self._store.add_keyframe(keyframe)
+                        self._keeper.add_keyframe(keyframe)
                 except MapError:
                     self._refuse(keyframe.id)
                     raise
@@ -170,27 +174,24 @@ class BackendNode:
         try:
             with self._meter.timed("map"):
                 result = self._slam.step(keyframe, candidates)
-            self._tell(result)
-            if self._store is not None:
-                self._store.set_meta({MAPPED: str(keyframe_id)})
+            self._tell(result, keyframe_id, mapped)
         except Exception as error:
             mapped.set_exception(error)
             raise
-        mapped.set_result(None)
 
-    def _tell(self, result: StepResult) -> None:
-        """Write down and publish what a step has found."""
+    def _tell(self, result: StepResult, mapped_id: int | None = None, mapped: "Future[None] | None" = None) -> None:
+        """Write down and publish what a step has found; ``mapped`` is done when it is on disk."""
         self._meter.add(result.timings_ms)
-        if self._store is not None and result.loops:
-            self._store.add_loops(result.loops)
+        snapshot: MapSnapshot | None = self._slam.snapshot() if result.optimised else None
+        if self._keeper is not None:
+            self._keeper.save(result.loops, snapshot, mapped_id, mapped)
+        elif mapped is not None:
+            mapped.set_result(None)
         for loop in result.loops:
             self._meter.count(f"verdicts_{loop.reason}")
             self._bus.publish(topics.LOOP, loop)
-        if result.optimised:
+        if snapshot is not None:
             self._meter.count("optimisations")
-            snapshot: MapSnapshot = self._slam.snapshot()
-            if self._store is not None:
-                self._store.update_poses(snapshot)
             self._bus.publish(topics.MAP, snapshot)
 
     def _rank(self, observation: PlaceObservation) -> Candidates:
@@ -206,7 +207,7 @@ class BackendNode:
 def build(bus: Bus, settings: NodeSettings) -> BackendNode:
     """Return the node for the settings; raises MapError and its kin when the map cannot be used."""
     config, mode = settings.config, settings.mode
-    store = None if settings.map_path is None else MapStore(settings.map_path)
+    store = None if settings.map_path is None else _open(settings.map_path, settings.patient)
     solver: Solver | None = None
     try:
         if store is not None:
@@ -221,6 +222,7 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
             settings.rig.cam0 if settings.rig else None,
             no_loops=settings.no_loops,
             solver=solver,
+            patient=settings.patient,
         )
     except BaseException:
         if solver is not None:
@@ -228,6 +230,16 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
         if store is not None:
             store.close()
         raise
+
+
+def _open(path: Path, patient: bool) -> MapStore:
+    """Return the map for writing; a patient service takes one that cannot be written as it is."""
+    try:
+        return MapStore(path)
+    except MapUnwritableError:
+        if not patient:
+            raise
+        return MapStore(path, read_only=True)
 
 
 def _solver(settings: NodeSettings) -> Solver:
@@ -243,7 +255,7 @@ def _sign(store: MapStore, settings: NodeSettings) -> None:
     meta = store.meta()
     if meta.get("mode", settings.mode) != settings.mode:
         raise MapError(f"the map {store.path} was made in mode {meta['mode']} and cannot go on in {settings.mode}")
-    if "mode" not in meta:
+    if "mode" not in meta and not store.file.read_only:
         made_by = {"seamark": __version__, "config_hash": config_hash(settings.config)}
         store.set_meta({"mode": str(settings.mode)} | made_by)
 

@@ -14,28 +14,42 @@ from seamark.frontend.odometry import Frontend
 from seamark.frontend.types import Frame, Keyframe, Odometry, Outcome, Quality
 from seamark.service import topics
 from seamark.service.bus import Bus
+from seamark.service.nodes.keyframe_relay import KeyframeRelay
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Done, EncodedFrame, Status
 from seamark.service.sources.decode import UnreadableImageError, decode, to_image
 
+STALL_S = 2.0  # without an acknowledgement: then the map takes nothing
+
 
 class FrontendNode:
     """Feeds frames to the front end, one at a time, and sends on what comes out.
 
     Frames come as requests, where none is lost, or from the stream of a live camera. Keyframe and session numbers begin
-    at ``first_keyframe_id`` and ``first_session``.
+    at ``first_keyframe_id`` and ``first_session``. Frames wait for a slow map, unless it is ``patient`` and takes
+    nothing for STALL_S: then keyframes are left out, and counted, until it takes them again.
     """
 
-    def __init__(self, bus: Bus, frontend: Frontend, *, first_keyframe_id: int = 0, first_session: int = 0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        frontend: Frontend,
+        *,
+        first_keyframe_id: int = 0,
+        first_session: int = 0,
+        patient: bool = False,
+    ) -> None:
         self._bus = bus
         self._frontend = frontend
         self._first_keyframe_id = first_keyframe_id
         self._first_session = first_session
         self._meter = Meter(bus.node)
         self._lock = threading.Lock()  # the camera's stream comes in a thread of its own
-        self._finished = False
+        self._patient = patient
+        self._relay = KeyframeRelay()
+        self._stalled = False
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
         bus.handle(topics.FRAME, self._on_frame)
@@ -81,8 +95,14 @@ class FrontendNode:
         return Done(self._bus.node)
 
     def _send(self, keyframes: tuple[Keyframe, ...]) -> None:
-        for keyframe in keyframes:
-            self._bus.send(topics.KEYFRAME, self._shift_keyframe(keyframe))
+        for keyframe in map(self._shift_keyframe, keyframes):
+            if self._patient:
+                self._stalled = not self._bus.wait_for_room(topics.KEYFRAME, 0.0 if self._stalled else STALL_S)
+            if self._stalled:
+                self._relay.left_out(keyframe)
+                self._meter.count("keyframes_left_out")
+                continue
+            self._bus.send(topics.KEYFRAME, self._relay.sent(keyframe))
             self._meter.count("keyframes")
 
     def _shift_keyframe(self, keyframe: Keyframe) -> Keyframe:
@@ -152,7 +172,11 @@ def build(bus: Bus, settings: NodeSettings) -> FrontendNode:
     """Return the node for the settings; raises CalibrationError."""
     frontend = Frontend(settings.rig, settings.mode, settings.config.frontend)
     return FrontendNode(
-        bus, frontend, first_keyframe_id=settings.first_keyframe_id, first_session=settings.first_session
+        bus,
+        frontend,
+        first_keyframe_id=settings.first_keyframe_id,
+        first_session=settings.first_session,
+        patient=settings.patient,
     )
 
 

@@ -15,6 +15,7 @@ class NodeSettings:
     ``first_keyframe_id`` and ``first_session`` let a front end that was restarted go on counting. ``solver_process``
     puts the pose graph's solver into a process of its own, so that queries stay answered while it works. ``restore``
     tells the vocabulary that there is a map to take places from; the back end, which owns the file, always looks.
+    ``patient`` lets the back end wait for a disk that takes no more, where a run would end.
     """
 
     mode: Mode
@@ -29,4 +30,5 @@ class NodeSettings:
     first_session: int = 0
     solver_process: bool = True
     restore: bool = False
+    patient: bool = False
     log_level: str = "WARNING"
