@@ -1,5 +1,6 @@
 """The odometry between any two keyframes of a session, with an honest uncertainty."""
 
+from collections import ChainMap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from seamark.backend.graph_types import Node
 from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
+_FIRST_ROWS = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,83 +30,122 @@ class Relative:
     scale_variance: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class _Link:
-    """One keyframe of a chain; what is summed is summed from the start of the session."""
-
-    node: Node
-    covariance_odom: Matrix  # sum of the motions' covariances, all moved to the odometry frame
-    length: float
-    angle: float
-    steps: int
-
-
 class OdometryChains:
     """The keyframes of all sessions and what odometry says between them.
 
     A motion's covariance is moved into the odometry frame by its adjoint and summed there, so the covariance between
     any two keyframes is a difference of two sums, moved into the frame asked for. A bias that grows with length,
-    angle and count is added (see :class:`DriftConfig`).
+    angle and count is added (see :class:`DriftConfig`). All sums run from the start of the session, in columns with
+    one row per keyframe.
     """
 
     def __init__(self, config: DriftConfig) -> None:
         self._config = config
-        self._links: dict[int, _Link] = {}
-        self._last: dict[int, int] = {}
+        self._inflation = config.covariance_inflation
+        self._nodes: list[Node] = []
+        self._rows: dict[int, int] = {}
+        self._last: dict[int, int] = {}  # session -> row of its last keyframe
+        self._T_odom_cam = np.zeros((_FIRST_ROWS, 4, 4))
+        self._covariance_odom = np.zeros((_FIRST_ROWS, 6, 6))
+        self._walked = np.zeros((_FIRST_ROWS, 2))  # angle, length
+        self._steps = np.zeros(_FIRST_ROWS, np.int64)
+        self._metric = np.zeros(_FIRST_ROWS, bool)
 
     def __contains__(self, keyframe_id: int) -> bool:
-        return keyframe_id in self._links
+        return keyframe_id in self._rows
 
     def add(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is known or its predecessor is not."""
-        if node.id in self._links:
-            raise BackendInputError(f"keyframe {node.id} was given twice")
-        previous_id = node.previous_id if node.previous_id is not None else self._last.get(node.session)
-        if previous_id is None:
-            self._links[node.id] = _Link(node, np.zeros((6, 6)), 0.0, 0.0, 0)
-            self._last[node.session] = node.id
-            return
-        before = self._links.get(previous_id)
-        if before is None or before.node.session != node.session:
-            raise BackendInputError(f"keyframe {node.id} follows {previous_id}, which is not known in its session")
-        motion = se3.inverse(before.node.T_odom_cam) @ node.T_odom_cam
-        Ad = se3.adjoint(node.T_odom_cam)
-        self._links[node.id] = _Link(
-            node,
-            before.covariance_odom + Ad @ (node.covariance * self._config.covariance_inflation) @ Ad.T,
-            before.length + float(np.linalg.norm(motion[:3, 3])),
-            before.angle + float(se3.rotation_angle(motion[:3, :3])),
-            before.steps + 1,
-        )
-        self._last[node.session] = node.id
+        self.extend([node])
+
+    def extend(self, nodes: Sequence[Node]) -> None:
+        """Append keyframes; raises BackendInputError as ``add`` does, and then none of them is appended."""
+        first, before = len(self._nodes), self._predecessors(nodes)
+        rows = np.arange(first, first + len(nodes))
+        self._grow(first + len(nodes))
+        self._T_odom_cam[rows] = np.stack([node.T_odom_cam for node in nodes])
+        self._metric[rows] = [node.metric for node in nodes]
+        motions = se3.inverse(self._T_odom_cam[np.where(before < 0, rows, before)]) @ self._T_odom_cam[rows]
+        Ad = adjoint_stack(self._T_odom_cam[rows])
+        covariances = np.stack([node.covariance for node in nodes]) * self._inflation
+        moved = Ad @ covariances @ np.swapaxes(Ad, 1, 2)
+        walked = np.stack([se3.rotation_angle(motions[:, :3, :3]), np.linalg.norm(motions[:, :3, 3], axis=1)], axis=1)
+        for k, (row, previous) in enumerate(zip(rows.tolist(), before.tolist(), strict=True)):
+            if previous >= 0:
+                self._covariance_odom[row] = self._covariance_odom[previous] + moved[k]
+                self._walked[row] = self._walked[previous] + walked[k]
+                self._steps[row] = self._steps[previous] + 1
+        for row, node in zip(rows.tolist(), nodes, strict=True):
+            self._nodes.append(node)
+            self._rows[node.id] = self._last[node.session] = row
+
+    def inflate(self, factor: float) -> None:
+        """Multiply the covariances of all motions, past and to come: odometry is worse than was thought."""
+        self._inflation *= factor
+        self._covariance_odom *= factor
 
     def node(self, keyframe_id: int) -> Node:
         """Return the keyframe; raises BackendInputError when it is unknown."""
-        if keyframe_id not in self._links:
+        if keyframe_id not in self._rows:
             raise BackendInputError(f"keyframe {keyframe_id} is not known")
-        return self._links[keyframe_id].node
+        return self._nodes[self._rows[keyframe_id]]
+
+    def step(self, keyframe_id: int) -> int:
+        """Return how many motions lie between the start of the session and the keyframe."""
+        return int(self._steps[self._rows[keyframe_id]])
+
+    def extent(self) -> Matrix:
+        """Return the sides (3,) of the box that holds all keyframes' odometry positions."""
+        positions = self._T_odom_cam[: len(self._nodes), :3, 3]
+        return np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
 
     def relative(self, ids_a: Sequence[int], ids_b: Sequence[int]) -> Relative:
         """Return the motions from each b to its a (``T_a_b``); each pair must be of one session."""
-        a = [self._links[i] for i in ids_a]
-        b = [self._links[i] for i in ids_b]
-        T_a_odom = se3.inverse(np.stack([link.node.T_odom_cam for link in a]))
-        T_odom_b = np.stack([link.node.T_odom_cam for link in b])
+        a = np.array([self._rows[i] for i in ids_a], np.int64)
+        b = np.array([self._rows[i] for i in ids_b], np.int64)
+        T_odom_b = self._T_odom_cam[b]
         Ad = adjoint_stack(se3.inverse(T_odom_b))
-        summed = np.stack([x.covariance_odom for x in b]) - np.stack([x.covariance_odom for x in a])
-        steps = np.array([y.steps - x.steps for x, y in zip(a, b, strict=True)], np.int64)
+        steps = self._steps[b] - self._steps[a]
+        summed = self._covariance_odom[b] - self._covariance_odom[a]
         summed *= np.where(steps < 0, -1.0, 1.0)[:, None, None]
         covariance = Ad @ summed @ np.swapaxes(Ad, 1, 2)
-        metric = np.array([link.node.metric for link in b])
+        steps, metric = np.abs(steps), self._metric[b]
         fraction = np.where(metric, self._config.translation_fraction, self._config.mono_translation_fraction)
-        lengths = np.abs([y.length - x.length for x, y in zip(a, b, strict=True)])
-        angles = np.abs([y.angle - x.angle for x, y in zip(a, b, strict=True)])
-        steps = np.abs(steps)
+        angles, lengths = np.abs(self._walked[b] - self._walked[a]).T
         turning = self._config.rotation_fraction * angles + np.deg2rad(self._config.rotation_deg_per_keyframe) * steps
         bias = np.repeat(np.stack([turning, fraction * lengths], axis=1), 3, axis=1)
         covariance += np.eye(6) * (bias**2)[:, :, None]
         scale_variance = np.where(metric, 0.0, self._config.scale_per_keyframe**2 * steps)
-        return Relative(T_a_odom @ T_odom_b, covariance, steps, scale_variance)
+        return Relative(se3.inverse(self._T_odom_cam[a]) @ T_odom_b, covariance, steps, scale_variance)
+
+    def _predecessors(self, nodes: Sequence[Node]) -> NDArray[np.int64]:
+        """Return the row (N,) that each keyframe hangs on, -1 where it starts a session."""
+        rows: ChainMap[int, int] = ChainMap({}, self._rows)
+        last: ChainMap[int, int] = ChainMap({}, self._last)
+        first, out = len(self._nodes), np.full(len(nodes), -1)
+        for row, node in enumerate(nodes, start=first):
+            if node.id in rows:
+                raise BackendInputError(f"keyframe {node.id} was given twice")
+            before = rows.get(node.previous_id) if node.previous_id is not None else last.get(node.session)
+            session = None
+            if before is not None:
+                session = (self._nodes[before] if before < first else nodes[before - first]).session
+            if node.previous_id is not None and session != node.session:
+                raise BackendInputError(
+                    f"keyframe {node.id} follows {node.previous_id}, which is not known in its session"
+                )
+            out[row - first] = -1 if before is None else before
+            rows[node.id] = last[node.session] = row
+        return out
+
+    def _grow(self, rows: int) -> None:
+        """Make room for so many rows; doubling keeps the cost per keyframe constant."""
+        while len(self._steps) < rows:
+            self._T_odom_cam = np.concatenate([self._T_odom_cam, np.zeros_like(self._T_odom_cam)])
+            self._covariance_odom = np.concatenate([self._covariance_odom, np.zeros_like(self._covariance_odom)])
+            self._walked = np.concatenate([self._walked, np.zeros_like(self._walked)])
+            self._steps = np.concatenate([self._steps, np.zeros_like(self._steps)])
+            self._metric = np.concatenate([self._metric, np.zeros_like(self._metric)])
 
 
 def white_covariance(node: Node, motion: Matrix, config: DriftConfig) -> Matrix:

@@ -120,6 +120,15 @@ class ConsistencyConfig(_Section):
         default=100, ge=2, description="nearest loops of the same sessions that one is compared with"
     )
     clique_starts: int = Field(default=20, ge=1, description="starts of the greedy clique search")
+    lone_false_alarm: float = Field(
+        default=1e-4,
+        ge=0,
+        le=1,
+        description="chance to pass below which a loop alone is accepted",
+    )
+    contest_ratio: float = Field(
+        default=2.0, ge=1, description="how much heavier than what contradicts it an accepted group must be"
+    )
 
 
 class GraphConfig(_Section):

@@ -6,6 +6,7 @@ the covariances; of all loops the largest set in which every pair agrees is kept
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,53 +27,81 @@ def similarity(constraint: Constraint) -> Matrix:
 
 def gate_chi2(constraint: Constraint, chains: OdometryChains) -> float:
     """Return chi squared (6 dof) of a loop within one session against the odometry between its ends."""
-    odometry = chains.relative([constraint.query_id], [constraint.match_id])
-    S = similarity(constraint)[None]
-    E = S @ odometry.T_a_b  # ends in the match's frame, where the odometry's covariance is
+    return float(odometry_chi2([constraint], chains)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Cycles:
+    """K cycles of loops and odometry.
+
+    ``error`` (K, 6) rotation first, with covariances ``odometry`` and ``loops`` (K, 6, 6) of what it is made of;
+    ``log_scale`` (K,) with ``scale_variance`` (K,); ``steps`` (K, 2) of odometry between the queries and the matches.
+    """
+
+    error: Matrix
+    odometry: Matrix
+    loops: Matrix
+    log_scale: NDArray[np.float64]
+    scale_variance: NDArray[np.float64]
+    steps: NDArray[np.int64]
+
+    def chi2(self) -> NDArray[np.float64]:
+        """Return chi squared (K,) of the errors; infinite where it is no number."""
+        return chi_squared(self.error, self.odometry + self.loops, self.log_scale, self.scale_variance)
+
+
+def odometry_chi2(loops: Sequence[Constraint], chains: OdometryChains) -> NDArray[np.float64]:
+    """Return chi squared (K,) (6 dof) of loops, each within one session, against the odometry between their ends."""
+    return odometry_cycles(loops, chains).chi2()
+
+
+def odometry_cycles(loops: Sequence[Constraint], chains: OdometryChains) -> Cycles:
+    """Return the cycles that loops, each within one session, close with the odometry between their ends."""
+    odometry = chains.relative([loop.query_id for loop in loops], [loop.match_id for loop in loops])
+    E = _stack(loops) @ odometry.T_a_b  # ends in the match's frame, where the odometry's covariance is
     Ad = adjoint_stack(np.linalg.inv(odometry.T_a_b))
-    covariance = odometry.covariance + Ad @ constraint.covariance @ np.swapaxes(Ad, 1, 2)
-    scale_variance = odometry.scale_variance + constraint.scale_sigma**2
-    return float(_chi2(E, covariance, scale_variance)[0])
+    moved = Ad @ _covariances(loops) @ np.swapaxes(Ad, 1, 2)
+    steps = np.stack([odometry.keyframes, odometry.keyframes], axis=1)
+    scale_variance = odometry.scale_variance + _scale_variances(loops)
+    return _cycles(E, odometry.covariance, moved, scale_variance, steps)
 
 
 def pair_chi2(
-    loop: Constraint, others: Sequence[Constraint], chains: OdometryChains
+    loops: Sequence[Constraint], others: Sequence[Constraint], chains: OdometryChains
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return chi squared (K,) of the cycles that ``loop`` closes with each other loop, and the odometry steps in them.
+    """Return chi squared (K,) of the cycles of K pairs of loops (see ``pair_cycles``) and their steps (K, 2)."""
+    cycles = pair_cycles(loops, others, chains)
+    return cycles.chi2(), cycles.steps
 
-    The other loops must join the same two sessions in the same order. The steps (K, 2) are between the two queries and
-    between the two matches.
-    """
-    K = len(others)
-    S1 = np.broadcast_to(similarity(loop), (K, 4, 4))
-    S2_inverse = np.linalg.inv(np.stack([similarity(other) for other in others]))
-    queries = chains.relative([loop.query_id] * K, [other.query_id for other in others])
-    matches = chains.relative([other.match_id for other in others], [loop.match_id] * K)
+
+def pair_cycles(loops: Sequence[Constraint], others: Sequence[Constraint], chains: OdometryChains) -> Cycles:
+    """Return the cycles that K pairs of loops close; both of a pair must join the same two sessions in one order."""
+    S1, S2 = _stack(loops), _stack(others)
+    queries = chains.relative([loop.query_id for loop in loops], [other.query_id for other in others])
+    matches = chains.relative([other.match_id for other in others], [loop.match_id for loop in loops])
     # match1 <- query1 <- query2 <- match2 <- match1; errors are moved to the end, the frame of match1.
-    end_match2 = np.linalg.inv(matches.T_a_b)
-    end_query2 = end_match2 @ np.linalg.inv(S2_inverse)
-    end_query1 = end_query2 @ np.linalg.inv(queries.T_a_b)
-    E = S1 @ queries.T_a_b @ S2_inverse @ matches.T_a_b
-    covariance = matches.covariance.copy()
-    covariances2 = np.stack([other.covariance for other in others])
-    for frame, part in ((end_query2, queries.covariance + covariances2), (end_query1, loop.covariance[None])):
-        Ad = adjoint_stack(frame)
-        covariance += Ad @ part @ np.swapaxes(Ad, 1, 2)
-    scale_variance = queries.scale_variance + matches.scale_variance + loop.scale_sigma**2
-    scale_variance = scale_variance + np.array([other.scale_sigma**2 for other in others])
+    end_query2 = np.linalg.inv(matches.T_a_b) @ S2
+    Ad2 = adjoint_stack(end_query2)
+    Ad1 = adjoint_stack(end_query2 @ np.linalg.inv(queries.T_a_b))
+    E = S1 @ queries.T_a_b @ np.linalg.inv(S2) @ matches.T_a_b
+    odometry = matches.covariance + Ad2 @ queries.covariance @ np.swapaxes(Ad2, 1, 2)
+    own = Ad2 @ _covariances(others) @ np.swapaxes(Ad2, 1, 2) + Ad1 @ _covariances(loops) @ np.swapaxes(Ad1, 1, 2)
+    scale_variance = queries.scale_variance + matches.scale_variance
+    scale_variance = scale_variance + _scale_variances(loops) + _scale_variances(others)
     steps = np.stack([queries.keyframes, matches.keyframes], axis=1)
-    return _chi2(E, covariance, scale_variance), steps
+    return _cycles(E, odometry, own, scale_variance, steps)
 
 
 def consistent_matrix(loops: Sequence[Constraint], chains: OdometryChains, chi2: float) -> NDArray[np.bool_]:
     """Return which pairs (N, N) agree; loops of other session pairs say nothing of each other and agree."""
-    sessions = [(chains.node(x.query_id).session, chains.node(x.match_id).session) for x in loops]
+    sessions = np.array([(chains.node(x.query_id).session, chains.node(x.match_id).session) for x in loops])
     agree = np.ones((len(loops), len(loops)), bool)
-    for i in range(len(loops)):
-        same = [j for j in range(i + 1, len(loops)) if sessions[j] == sessions[i]]
-        if same:
-            values, _ = pair_chi2(loops[i], [loops[j] for j in same], chains)
-            agree[i, same] = agree[same, i] = values <= chi2
+    rows, columns = np.triu_indices(len(loops), 1)
+    same = (sessions[rows] == sessions[columns]).all(axis=1)
+    rows, columns = rows[same], columns[same]
+    if len(rows):
+        values, _ = pair_chi2([loops[i] for i in rows], [loops[j] for j in columns], chains)
+        agree[rows, columns] = agree[columns, rows] = values <= chi2
     return agree
 
 
@@ -101,11 +130,52 @@ def greedy_clique(agree: NDArray[np.bool_], weights: NDArray[np.float64], starts
     return best
 
 
-def _chi2(E: NDArray[np.floating], covariance: Matrix, scale_variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return chi squared (K,) of cycles E (K, 4, 4) = [sR t; 0 1] against the identity, to first order."""
-    scale = np.cbrt(np.linalg.det(E[:, :3, :3]))
-    rotations = np.stack([se3.log_rotation(R) for R in E[:, :3, :3] / scale[:, None, None]])
-    error = np.concatenate([rotations, E[:, :3, 3]], axis=1)
+def chi_squared(
+    error: Matrix, covariance: Matrix, log_scale: NDArray[np.float64], scale_variance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return chi squared (K,) of errors (K, 6) and of log scales (K,); infinite where it is no number."""
     weighted = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
-    values = (error * weighted).sum(axis=1) + np.log(scale) ** 2 / scale_variance
+    values = (error * weighted).sum(axis=1) + log_scale**2 / scale_variance
     return np.where(np.isfinite(values), values, np.inf)
+
+
+def cycle_error(E: NDArray[np.floating]) -> tuple[Matrix, NDArray[np.float64]]:
+    """Return the errors (K, 6), rotation first, and the log scales (K,) of cycles E (K, 4, 4) = [sR t; 0 1]."""
+    scale = np.cbrt(np.linalg.det(E[:, :3, :3]))
+    return np.concatenate([log_rotations(E[:, :3, :3] / scale[:, None, None]), E[:, :3, 3]], axis=1), np.log(scale)
+
+
+def log_rotations(R: Matrix) -> Matrix:
+    """Return the rotation vectors (K, 3) of rotations (K, 3, 3)."""
+    R = np.asarray(R, dtype=np.float64)
+    angles = se3.rotation_angle(R)
+    axes = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    out = axes / np.sinc(angles / np.pi)[:, None]  # numpy's sinc has pi inside
+    for k in np.flatnonzero(angles > 3.0):  # near half a turn the axis is no longer in the skew part
+        out[k] = se3.log_rotation(R[k])
+    return out
+
+
+def _cycles(
+    E: NDArray[np.floating],
+    odometry: Matrix,
+    loops: Matrix,
+    scale_variance: NDArray[np.float64],
+    steps: NDArray[np.int64],
+) -> Cycles:
+    error, log_scale = cycle_error(E)
+    return Cycles(error, odometry, loops, log_scale, scale_variance, steps)
+
+
+def _stack(loops: Sequence[Constraint]) -> Matrix:
+    S = np.stack([loop.T_match_query for loop in loops])
+    S[:, :3, :3] *= np.array([loop.scale for loop in loops])[:, None, None]
+    return S
+
+
+def _covariances(loops: Sequence[Constraint]) -> Matrix:
+    return np.stack([loop.covariance for loop in loops])
+
+
+def _scale_variances(loops: Sequence[Constraint]) -> NDArray[np.float64]:
+    return np.array([loop.scale_sigma**2 for loop in loops])

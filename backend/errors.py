@@ -7,6 +7,10 @@ class BackendInputError(SeamarkError):
     """A keyframe or loop handed to the back end is malformed or contradicts what it knows."""
 
 
+class GraphFileError(BackendInputError):
+    """A file is no pose graph, or one with impossible numbers."""
+
+
 class SolverError(SeamarkError):
     """The solver could not be kept alive, or could not solve."""
 

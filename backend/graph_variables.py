@@ -39,15 +39,21 @@ class PoseVariables:
 
     def odometry(self, previous_id: int, node: Node, motion: Matrix) -> gtsam.NonlinearFactor:
         """Join a keyframe with its predecessor."""
-        noise = gtsam.noiseModel.Gaussian.Covariance(white_covariance(node, motion, self._drift))
+        noise = self._gaussian(white_covariance(node, motion, self._drift))
         return gtsam.BetweenFactorPose3(previous_id, node.id, self.value(motion), noise)
 
     def loop(self, constraint: Constraint) -> gtsam.NonlinearFactor:
         """Join a keyframe with the one it has recognised."""
-        noise = gtsam.noiseModel.Gaussian.Covariance(constraint.covariance)
         measured = self.value(constraint.T_match_query)
-        robust = _cauchy(noise, self._config.cauchy_width)
+        robust = _cauchy(self._gaussian(constraint.covariance), self._config.cauchy_width)
         return gtsam.BetweenFactorPose3(constraint.match_id, constraint.query_id, measured, robust)
+
+    def _gaussian(self, covariance: Matrix) -> gtsam.noiseModel.Gaussian:
+        return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+    def covariance(self, block: Matrix) -> Matrix:
+        """Return a variable's marginal covariance as (6, 6), rotation first."""
+        return np.asarray(block[:6, :6])
 
     def make_isam(self) -> gtsam.ISAM2:
         """Return an empty iSAM2; QR, because Cholesky fails on long open chains."""
@@ -56,6 +62,51 @@ class PoseVariables:
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(self._config.relinearise_threshold)
         return gtsam.ISAM2(parameters)
+
+
+class PlanarVariables(PoseVariables):
+    """Poses in the plane z = 0 as GTSAM's Pose2, tangent x, y, turn; a third of the work of rigid poses."""
+
+    AXES = (3, 4, 2)  # where x, y and the turn lie among six
+
+    def value(self, M: Matrix) -> Any:
+        """Return the variable of pose M."""
+        return gtsam.Pose2(M[0, 3], M[1, 3], float(np.arctan2(M[1, 0], M[0, 0])))
+
+    def matrices(self, values: gtsam.Values, ids: NDArray[np.int64]) -> Matrix:
+        """Return the poses (N, 4, 4) of ascending ids, which must be all."""
+        x, y, theta = gtsam.utilities.extractPose2(values).T
+        out = np.tile(np.eye(4), (len(ids), 1, 1))
+        out[:, 0, 0] = out[:, 1, 1] = np.cos(theta)
+        out[:, 1, 0] = np.sin(theta)
+        out[:, 0, 1] = -out[:, 1, 0]
+        out[:, 0, 3], out[:, 1, 3] = x, y
+        return out
+
+    def prior(self, keyframe_id: int, M: Matrix) -> gtsam.NonlinearFactor:
+        """Hold the first pose of a component."""
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, self._config.prior_sigma)
+        return gtsam.PriorFactorPose2(keyframe_id, self.value(M), noise)
+
+    def odometry(self, previous_id: int, node: Node, motion: Matrix) -> gtsam.NonlinearFactor:
+        """Join a keyframe with its predecessor."""
+        noise = self._gaussian(white_covariance(node, motion, self._drift))
+        return gtsam.BetweenFactorPose2(previous_id, node.id, self.value(motion), noise)
+
+    def loop(self, constraint: Constraint) -> gtsam.NonlinearFactor:
+        """Join a keyframe with the one it has recognised."""
+        measured = self.value(constraint.T_match_query)
+        robust = _cauchy(self._gaussian(constraint.covariance), self._config.cauchy_width)
+        return gtsam.BetweenFactorPose2(constraint.match_id, constraint.query_id, measured, robust)
+
+    def _gaussian(self, covariance: Matrix) -> gtsam.noiseModel.Gaussian:
+        return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(self.AXES, self.AXES)])
+
+    def covariance(self, block: Matrix) -> Matrix:
+        """Return a variable's marginal covariance as (6, 6), rotation first; zero along what a plane does not know."""
+        out = np.zeros((6, 6))
+        out[np.ix_(self.AXES, self.AXES)] = block
+        return out
 
 
 class SimilarityVariables(PoseVariables):

@@ -1,19 +1,21 @@
 """All keyframes' poses, from odometry and loops, by GTSAM."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.config import BackendConfig, DriftConfig, GraphConfig
-from seamark.backend.consistency import similarity
+from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.errors import BackendInputError, SolverError
 from seamark.backend.graph_types import Constraint, Estimate, Node, check_constraint, check_node
-from seamark.backend.graph_variables import PoseVariables, SimilarityVariables
+from seamark.backend.graph_variables import PlanarVariables, PoseVariables, SimilarityVariables
 from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
+Key = tuple[int, int]
+_FIRST_ROWS = 1024
 
 
 class PoseGraph:
@@ -24,52 +26,57 @@ class PoseGraph:
     they hang on the last pose by their odometry. A loop within a component is an incremental update; joining,
     withdrawing and ``thorough`` solve all by Levenberg-Marquardt, and so does an incremental update that failed or
     did not lower the error. Metric sessions have rigid poses. From the first session without metric scale on all
-    poses are similarities whose scale may drift (rigid motions in metric sessions keep it).
+    poses are similarities whose scale may drift (rigid motions in metric sessions keep it). ``planar``: all motions are
+    in the plane z = 0, and so are the poses.
     """
 
-    def __init__(self, config: BackendConfig) -> None:
+    def __init__(self, config: BackendConfig, planar: bool = False) -> None:
         self._config: GraphConfig = config.graph
         self._drift: DriftConfig = config.drift
-        self._nodes: dict[int, Node] = {}
-        self._previous: dict[int, int | None] = {}
-        self._members: dict[int, list[int]] = {}  # session -> its keyframes in order
-        self._loops: dict[tuple[int, int], Constraint] = {}
-        self._poses: dict[int, Matrix] = {}  # [sR t; 0 1] from keyframe to map
+        self._nodes: list[Node] = []
+        self._rows: dict[int, int] = {}
+        self._before: list[int] = []  # row of the predecessor, -1 where a session starts
+        self._first_rows: dict[int, int] = {}  # session -> row of its first and of its last keyframe
+        self._last_rows: dict[int, int] = {}
+        self._poses = np.tile(np.eye(4), (_FIRST_ROWS, 1, 1))  # [sR t; 0 1] from keyframe to map
+        self._loops: dict[Key, Constraint] = {}
         self._frames: dict[int, int] = {}  # session -> session in whose frame its poses are
-        self._variables: PoseVariables | SimilarityVariables = PoseVariables(self._config, self._drift)
+        kind = PlanarVariables if planar else PoseVariables
+        self._variables: PoseVariables = kind(self._config, self._drift)
         self._isam: gtsam.ISAM2 | None = None
-        self._new_nodes: list[int] = []
-        self._new_loops: list[tuple[int, int]] = []
+        self._solved_rows = 0  # those that iSAM2 knows
+        self._new_loops: list[Key] = []
         self._revision = 0
 
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed or was given before."""
         check_node(node)
-        if node.id in self._nodes:
+        if node.id in self._rows:
             raise BackendInputError(f"keyframe {node.id} was given twice")
-        members = self._members.get(node.session, [])
-        previous_id = node.previous_id if node.previous_id is not None else (members[-1] if members else None)
-        if previous_id is not None and previous_id not in members:
-            raise BackendInputError(f"keyframe {node.id} follows {previous_id}, which is not known in its session")
-        if not node.metric and isinstance(self._variables, PoseVariables):
+        before = self._last_rows.get(node.session, -1)
+        if node.previous_id is not None:
+            before = self._rows.get(node.previous_id, -1)
+            if before < 0 or self._nodes[before].session != node.session:
+                raise BackendInputError(f"keyframe {node.id} follows {node.previous_id}, which is not in its session")
+        if not node.metric and not isinstance(self._variables, SimilarityVariables):
             self._variables = SimilarityVariables(self._config, self._drift)
             self._isam = None
-        self._nodes[node.id] = node
-        self._previous[node.id] = previous_id
-        self._members.setdefault(node.session, []).append(node.id)
+        row = self._rows[node.id] = len(self._nodes)
+        self._nodes.append(node)
+        self._before.append(before)
+        self._first_rows.setdefault(node.session, row)
+        self._last_rows[node.session] = row
         self._frames.setdefault(node.session, node.session)
-        if previous_id is None:
-            self._poses[node.id] = node.T_odom_cam.copy()
-        else:
-            self._poses[node.id] = self._poses[previous_id] @ self._motion(node.id)
-        self._new_nodes.append(node.id)
+        if row == len(self._poses):
+            self._poses = np.concatenate([self._poses, self._poses])
+        self._poses[row] = node.T_odom_cam if before < 0 else self._poses[before] @ self._motion(row)
 
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop, replacing one of the same pair; it acts at the next ``optimise``."""
         check_constraint(constraint)
         key = (constraint.query_id, constraint.match_id)
         for keyframe_id in key:
-            if keyframe_id not in self._nodes:
+            if keyframe_id not in self._rows:
                 raise BackendInputError(f"loop {key[0]} to {key[1]} names keyframe {keyframe_id}, which is not known")
         if key in self._loops:
             self._isam = None
@@ -92,85 +99,114 @@ class PoseGraph:
         self._revision += 1
         return self._estimate()
 
+    def weights(self) -> dict[Key, float]:
+        """Return the weight (0..1) that the robust kernel leaves each loop at the present poses."""
+        if not self._loops:
+            return {}
+        loops = list(self._loops.values())
+        query, match = (self._poses[[self._rows[key[end]] for key in self._loops]] for end in (0, 1))
+        expected = np.linalg.inv(match) @ query
+        error, log_scale = cycle_error(np.linalg.inv(np.stack([similarity(loop) for loop in loops])) @ expected)
+        covariance = np.stack([loop.covariance for loop in loops])
+        scale_variance = np.array([loop.scale_sigma**2 for loop in loops])
+        chi2 = chi_squared(error, covariance, log_scale, scale_variance)
+        weights = 1 / (1 + chi2 / self._config.cauchy_width**2)
+        return dict(zip(self._loops, weights.tolist(), strict=True))
+
+    def covariances(self, keyframe_ids: Sequence[int]) -> Matrix:
+        """Return the marginal covariances (K, 6, 6) of poses, each in its keyframe's frame, rotation first.
+
+        Relative to the first keyframe of the component, as of the last ``optimise``. Raises BackendInputError for a
+        keyframe that is not known, SolverError where the system is indeterminate.
+        """
+        unknown = [keyframe_id for keyframe_id in keyframe_ids if keyframe_id not in self._rows]
+        if unknown:
+            raise BackendInputError(f"keyframe {unknown[0]} is not known")
+        try:
+            if self._isam is None or self._solved_rows < len(self._nodes):
+                self._solve_incremental()
+            assert self._isam is not None
+            blocks = [self._isam.marginalCovariance(keyframe_id) for keyframe_id in keyframe_ids]
+        except RuntimeError as error:
+            raise SolverError(f"the covariance of keyframes {list(keyframe_ids)} cannot be had: {error}") from error
+        return np.array([self._variables.covariance(block) for block in blocks]).reshape(-1, 6, 6)
+
     def close(self) -> None:
         """Do nothing: this solver holds no resources."""
 
-    def _motion(self, keyframe_id: int) -> Matrix:
+    def _motion(self, row: int) -> Matrix:
         """Return the odometry's motion from the keyframe to its predecessor."""
-        previous_id = self._previous[keyframe_id]
-        assert previous_id is not None
-        return se3.inverse(self._nodes[previous_id].T_odom_cam) @ self._nodes[keyframe_id].T_odom_cam
+        return se3.inverse(self._nodes[self._before[row]].T_odom_cam) @ self._nodes[row].T_odom_cam
 
     def _solve_incremental(self) -> None:
         """Update iSAM2 with what is new; fall back on the batch solution when that does not help."""
         fresh = self._isam is None
         if self._isam is None:
             self._isam = self._variables.make_isam()
-        nodes: Iterable[int] = self._nodes if fresh else self._new_nodes
-        loops: Iterable[tuple[int, int]] = self._loops if fresh else self._new_loops
-        graph, values = self._factors(nodes, loops)
+        rows = range(0 if fresh else self._solved_rows, len(self._nodes))
+        graph = self._factors(rows, self._loops if fresh else self._new_loops)
         try:
-            before = self._isam.getFactorsUnsafe().error(self._all_values()) + graph.error(self._all_values())
-            self._isam.update(graph, values)
-            error = float("inf")
+            error = before = self._isam.getFactorsUnsafe().error(self._isam.calculateEstimate())
+            before += graph.error(self._values(self._rows[key] for key in graph.keyVector()))
+            self._isam.update(graph, self._values(rows))
             for _ in range(self._config.incremental_updates):
-                self._isam.update()
-                estimate = self._isam.calculateEstimate()
-                last, error = error, self._isam.getFactorsUnsafe().error(estimate)
-                if not error < last * (1 - 1e-4):
+                if self._isam.update().getVariablesRelinearized() == 0:
                     break
+            estimate = self._isam.calculateEstimate()
+            error = self._isam.getFactorsUnsafe().error(estimate)
         except RuntimeError:  # GTSAM has no exception classes: an indeterminate or diverged system
             error, before = float("inf"), 0.0
         if not error <= before * (1 + 1e-6) + 1e-6:
             self._solve_batch()
             return
         self._keep(estimate)
+        self._solved_rows = len(self._nodes)
 
     def _solve_batch(self) -> None:
         """Solve the whole graph from the current poses."""
-        graph, values = self._factors(self._nodes, self._loops)
+        self._isam = None
+        if not self._nodes:
+            return
+        rows = range(len(self._nodes))
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self._config.batch_iterations)
-        self._isam = None
-        if len(self._nodes) > 0:
-            try:
-                estimate = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-            except RuntimeError as error:
-                raise SolverError(f"the pose graph of {len(self._nodes)} keyframes has no solution: {error}") from error
-            self._keep(estimate)
+        try:
+            graph = self._factors(rows, self._loops)
+            estimate = gtsam.LevenbergMarquardtOptimizer(graph, self._values(rows), parameters).optimize()
+        except RuntimeError as error:
+            raise SolverError(f"the pose graph of {len(self._nodes)} keyframes has no solution: {error}") from error
+        self._keep(estimate)
 
     def _keep(self, values: gtsam.Values) -> None:
         """Take over a solution; raises SolverError when it is not finite."""
-        ids = np.array(sorted(self._nodes), np.int64)
-        poses = self._variables.matrices(values, ids)
+        ids = self._ids()
+        order = np.argsort(ids, kind="stable")
+        poses = self._variables.matrices(values, ids[order])
         if not np.isfinite(poses).all():
             self._isam = None
             raise SolverError(f"the pose graph of {len(ids)} keyframes has no finite solution")
-        self._poses.update(zip(ids.tolist(), poses, strict=True))
-        self._new_nodes.clear()
+        self._poses[order] = poses
         self._new_loops.clear()
 
-    def _factors(
-        self, nodes: Iterable[int], loops: Iterable[tuple[int, int]]
-    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Return the factors and initial values that these keyframes and loops bring."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for keyframe_id in nodes:
-            node, previous_id = self._nodes[keyframe_id], self._previous[keyframe_id]
-            values.insert(keyframe_id, self._variables.value(self._poses[keyframe_id]))
-            if previous_id is not None:
-                graph.add(self._variables.odometry(previous_id, node, self._motion(keyframe_id)))
+    def _factors(self, rows: Iterable[int], loops: Iterable[Key]) -> gtsam.NonlinearFactorGraph:
+        """Return the factors that these keyframes and loops bring."""
+        graph = gtsam.NonlinearFactorGraph()
+        for row in rows:
+            node, before = self._nodes[row], self._before[row]
+            if before >= 0:
+                graph.add(self._variables.odometry(self._nodes[before].id, node, self._motion(row)))
             elif self._frames[node.session] == node.session:
-                graph.add(self._variables.prior(keyframe_id, self._poses[keyframe_id]))
+                graph.add(self._variables.prior(node.id, self._poses[row]))
         for key in loops:
             if key in self._loops:
                 graph.add(self._variables.loop(self._loops[key]))
-        return graph, values
+        return graph
 
-    def _all_values(self) -> gtsam.Values:
+    def _values(self, rows: Iterable[int]) -> gtsam.Values:
+        """Return the present poses of these rows."""
         values = gtsam.Values()
-        for keyframe_id in self._nodes:
-            values.insert(keyframe_id, self._variables.value(self._poses[keyframe_id]))
+        for row in rows:
+            values.insert(self._nodes[row].id, self._variables.value(self._poses[row]))
         return values
 
     def _settle_frames(self) -> bool:
@@ -179,57 +215,63 @@ class PoseGraph:
         changed = False
         for root in sorted(set(wanted.values())):
             if self._frames[root] != root:  # a withdrawn loop has set this component free
-                first = self._members[root][0]
+                first = self._first_rows[root]
                 G = self._nodes[first].T_odom_cam @ np.linalg.inv(self._poses[first])
                 self._move(self._frames[root], root, G, wanted)
                 changed = True
-        pending = True
+        pending = len(wanted) > 1
         while pending:
             pending = False
-            for (query_id, match_id), constraint in sorted(self._loops.items()):
-                a, b = self._nodes[match_id].session, self._nodes[query_id].session
+            for (query_id, match_id), constraint in sorted(self._loops.items(), key=lambda item: item[0]):
+                query, match = self._rows[query_id], self._rows[match_id]
+                a, b = self._nodes[match].session, self._nodes[query].session
                 root = wanted[a]
                 if (self._frames[a] == root) == (self._frames[b] == root):
                     continue
                 S = similarity(constraint)
                 if self._frames[a] == root:
-                    G = self._poses[match_id] @ S @ np.linalg.inv(self._poses[query_id])
+                    G = self._poses[match] @ S @ np.linalg.inv(self._poses[query])
                     self._move(self._frames[b], root, G, wanted)
                 else:
-                    G = self._poses[query_id] @ np.linalg.inv(S) @ np.linalg.inv(self._poses[match_id])
+                    G = self._poses[query] @ np.linalg.inv(S) @ np.linalg.inv(self._poses[match])
                     self._move(self._frames[a], root, G, wanted)
                 changed = pending = True
         return changed
 
     def _move(self, old: int, new: int, G: NDArray[np.floating], wanted: dict[int, int]) -> None:
         """Map all sessions that are in frame ``old`` and belong to component ``new`` by G into frame ``new``."""
-        for session, frame in self._frames.items():
-            if frame == old and wanted[session] == new:
-                self._frames[session] = new
-                for keyframe_id in self._members[session]:
-                    self._poses[keyframe_id] = np.asarray(G @ self._poses[keyframe_id])
+        moved = {session for session, frame in self._frames.items() if frame == old and wanted[session] == new}
+        rows = np.array([row for row, node in enumerate(self._nodes) if node.session in moved], np.int64)
+        self._poses[rows] = G @ self._poses[rows]
+        self._frames.update(dict.fromkeys(moved, new))
 
     def _components(self) -> dict[int, int]:
         """Return for each session the oldest one that loops join it with."""
-        roots = {session: session for session in self._members}
+        roots = {session: session for session in self._frames}
+        if len(roots) < 2:
+            return roots
 
         def root_of(session: int) -> int:
             while roots[session] != session:
                 session = roots[session]
             return session
 
-        for query_id, match_id in self._loops:
-            a, b = root_of(self._nodes[query_id].session), root_of(self._nodes[match_id].session)
+        for key in self._loops:
+            a, b = (root_of(self._nodes[self._rows[keyframe_id]].session) for keyframe_id in key)
             roots[max(a, b)] = min(a, b)
         return {session: root_of(session) for session in roots}
 
+    def _ids(self) -> NDArray[np.int64]:
+        return np.array([node.id for node in self._nodes], np.int64)
+
     def _estimate(self) -> Estimate:
-        ids = np.array(sorted(self._nodes), np.int64)
-        poses = np.array([self._poses[i] for i in ids.tolist()]).reshape(-1, 4, 4)
+        ids = self._ids()
+        order = np.argsort(ids, kind="stable")
+        poses = self._poses[order]
         scales = np.ones(len(ids))  # exactly, where all is metric
         if isinstance(self._variables, SimilarityVariables):
             scales = np.cbrt(np.linalg.det(poses[:, :3, :3]))
         T_map_cam = poses.copy()
         T_map_cam[:, :3, :3] /= scales[:, None, None]
-        components = np.array([self._frames[self._nodes[i].session] for i in ids.tolist()], np.int64)
-        return Estimate(self._revision, ids, components, T_map_cam, scales)
+        components = np.array([self._frames[node.session] for node in self._nodes], np.int64)[order]
+        return Estimate(self._revision, ids[order], components, T_map_cam, scales)

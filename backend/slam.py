@@ -12,7 +12,9 @@ from seamark.backend.config import BackendConfig
 from seamark.backend.consistency import gate_chi2
 from seamark.backend.errors import BackendInputError
 from seamark.backend.graph_types import Constraint, Node, Solver, check_node
-from seamark.backend.ledger import Finding, Key, LoopLedger, PlaceRelation, PoseRelation
+from seamark.backend.judge import PoseJudge
+from seamark.backend.judge_places import PlaceJudge
+from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
 from seamark.backend.likelihood import probability
 from seamark.backend.map_state import MapState
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
@@ -48,8 +50,10 @@ class Slam:
             raise BackendInputError(f"mode {mode} needs {'no' if mode == Mode.PLACES else 'a'} solver")
         self._config, self._solver, self._seed = config, solver, seed
         self._chains = OdometryChains(config.drift)
-        relation = PlaceRelation(config.places) if solver is None else PoseRelation(self._chains, config.consistency)
-        self._ledger = LoopLedger(relation, config.consistency.compared_loops, config.consistency.clique_starts)
+        judge: Judge = PlaceJudge(config.places, config.consistency)
+        if solver is not None:
+            judge = PoseJudge(self._chains, config.consistency)
+        self._ledger = LoopLedger(judge)
         self._map = MapState()
         self._loops: dict[Key, Loop] = {}
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told

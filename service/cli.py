@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from seamark import SeamarkError, __version__
+from seamark.service.graph_commands import graph_app
 from seamark.service.map_commands import map_app
 from seamark.service.places_commands import places_app
 from seamark.service.terminal import Bar, errors, print_json, print_table
@@ -32,6 +33,7 @@ synth_app = typer.Typer(no_args_is_help=True, help="Synthetic worlds with ground
 app.add_typer(vocab_app, name="vocab")
 app.add_typer(config_app, name="config")
 app.add_typer(synth_app, name="synth")
+app.add_typer(graph_app, name="graph")
 app.add_typer(places_app, name="places")
 app.add_typer(map_app, name="map")
 
