@@ -73,11 +73,11 @@ def eval_command(
 
     config = load_config(None, os.environ, override or [])
     options = places_eval.EvalOptions(out, sequence, vocab, distance, angle, tolerance, precision)
-    sources = [open_sources([spec], mode="places") for spec in (source, against) if spec is not None]
-    second = sources[1] if len(sources) > 1 else None
+    first = open_sources([source], mode=None if against is None else "places")  # in its own past odometry is asked
+    second = None if against is None else open_sources([against], mode="places")
     with Bar("describing") as bar:
         count = workers or available_workers()
-        report = places_eval.evaluate_places(sources[0], second, options, config, count, _warn, bar.count)
+        report = places_eval.evaluate_places(first, second, options, config, count, _warn, bar.count)
     if as_json:
         print_json(report)
     else:

@@ -20,6 +20,7 @@ from seamark.service.output import prepare_output
 from seamark.service.places_images import DescribedImage, Progress, describe_frames
 from seamark.service.places_match import matches_table, warn_of_unreadable, write_table
 from seamark.service.places_metrics import RECALL_AT, Curve
+from seamark.service.places_motion import follow
 from seamark.service.places_picture import draw_evaluation
 from seamark.service.places_search import Answer, search, search_own
 from seamark.service.sources.base import Source
@@ -79,6 +80,7 @@ def evaluate_places(
 ) -> dict[str, Any]:
     """Recognise the places of ``source`` in its own past, or those of ``against`` in ``source``, and judge it.
 
+    In its own past places must agree with odometry too, where the source is calibrated and of a mode that has any.
     Writes matches.csv, precision_recall.csv, places_eval.json and places_eval.png into ``options.out`` and returns what
     the JSON holds. Raises EvaluationError where nothing tells which images show the same place.
     """
@@ -90,17 +92,20 @@ def evaluate_places(
         top = max(RECALL_AT)
         arguments: dict[str, Any] = {"top": top, "in_order": options.in_order, "workers": workers}
         same, judged, said = truth
+        motion = None
         if against is None:
             settings = _own_settings(config.vocab, source)
             stamps = source.stamps_ns
             assert stamps is not None  # the truth was found by them
-            answers, eligible = search_own(database, stamps.tolist(), vocabulary, settings, **arguments)
+            motion = follow(source, config.frontend)
+            answers, eligible = search_own(database, stamps.tolist(), vocabulary, settings, **arguments, motion=motion)
             same = same & eligible
         else:
             answers = search(database, queries, vocabulary, config.vocab, **arguments)
         evaluation = Evaluation(answers, same, judged, said)
         report = build_report(evaluation, options)
         report |= {"source": source.name, "against": against.name if against else None, "words": vocabulary.n_words}
+        report["odometry"] = motion is not None
         write_table(output.staging / "matches.csv", matches_table(database, queries, answers))
         _write_curve(output.staging / "precision_recall.csv", evaluation.curve())
         (output.staging / "places_eval.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
@@ -148,6 +153,7 @@ def report_table(report: dict[str, Any]) -> Table:
     """Return the report for people."""
     table = Table(show_header=False, box=None)
     table.add_row("truth", report["truth"])
+    table.add_row("odometry", "asked" if report.get("odometry") else "not asked")
     table.add_row("places, queries", f"{report['places']}, {report['queries']}")
     table.add_row("with a true place", str(report["queries_with_a_true_place"]))
     for n, value in report["recall_at"].items():

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.service.places_images import DescribedImage
+from seamark.service.places_motion import AGREES, CONTRADICTS, Motion
 from seamark.vocab import confidence, sequence
 from seamark.vocab.confidence import Verdict
 from seamark.vocab.config import VocabConfig
@@ -17,6 +18,12 @@ from seamark.vocab.types import Candidate
 from seamark.vocab.vocabulary import Vocabulary
 
 VERIFIED = 20  # places of a query that are compared feature by feature
+CONTRADICTED, CONTRADICTED_IN_ORDER = 1.0, 5.0
+"""Taken off the score of a place that odometry contradicts: it ranks below all others."""
+
+STREAK = 4  # successive queries that found neighbouring places where odometry expects them
+STREAK_INLIERS = 20  # that each of them must have
+STREAK_STEP = 4  # places from one to the next
 DATABASE_SESSION, QUERY_SESSION, QUERY_ID = 0, 1, -1
 
 
@@ -94,8 +101,13 @@ def search_own(
     top: int,
     in_order: bool,
     workers: int,
+    motion: Motion | None = None,
 ) -> tuple[list[Answer], NDArray[np.bool_]]:
     """Answer every image of one sequence with places seen before it, the recent past excluded.
+
+    ``motion`` is what odometry says of these images. A place that it contradicts ranks last and is never accepted: two
+    places that look alike are told apart by nothing else as long as only one of them is known. In order, STREAK
+    successive images that found neighbouring places where odometry expects them are accepted.
 
     Returns the answers and (n, n) bool: which places each image might have been answered with.
     """
@@ -105,7 +117,10 @@ def search_own(
         observation = image.observation(row, DATABASE_SESSION, stamp_ns)
         _fill(table, row, index.query(observation, max(1, len(index))).ranked)
         index.add(observation)
-    return _answers(table, images, images, top, in_order, workers), np.isfinite(table.score)
+    answers = _answers(table, images, images, top, in_order, workers, motion)
+    if in_order and motion is not None:
+        answers = _accept_streaks(answers, motion)
+    return answers, np.isfinite(table.score)
 
 
 def _empty_table(queries: int, places: int) -> _Table:
@@ -127,12 +142,17 @@ def _answers(
     top: int,
     in_order: bool,
     workers: int,
+    motion: Motion | None = None,
 ) -> list[Answer]:
     evidence = _evidence_along_ways(table.score) if in_order else None
+    penalty = CONTRADICTED_IN_ORDER if in_order else CONTRADICTED
 
     def answer(row: int) -> Answer:
         eligible = np.flatnonzero(np.isfinite(table.score[row]))
         ordering = table.score[row] if evidence is None else evidence[row]
+        if motion is not None:
+            ordering = ordering.copy()
+            ordering[eligible[motion.judge(row, eligible) == CONTRADICTS]] -= penalty
         shortlist = eligible[np.argsort(-ordering[eligible], kind="stable")][: max(top, VERIFIED)]
         verified = {
             int(place): compare(queries[row].features, database[place].features) for place in shortlist[:VERIFIED]
@@ -143,10 +163,46 @@ def _answers(
         ranked = sorted(score, key=lambda place: (-score[place], place))
         off = 0.0 if in_order else confidence.doubt([score[place] for place in ranked[:VERIFIED]])
         matches = [_match(table, row, place, score[place] - off, verified.get(place)) for place in ranked[:top]]
-        return _decide(queries[row], matches, score[ranked[0]] if ranked else 0.0, in_order)
+        decided = _decide(queries[row], matches, score[ranked[0]] if ranked else 0.0, in_order)
+        return decided if motion is None else _heed(decided, row, motion)
 
     with ThreadPoolExecutor(workers, thread_name_prefix="compare") as pool:
         return list(pool.map(answer, range(len(queries))))
+
+
+def _heed(answer: Answer, row: int, motion: Motion) -> Answer:
+    """Say so where the best place is one that odometry contradicts, which is then not accepted."""
+    if not answer.matches or motion.judge(row, np.array([answer.matches[0].place]))[0] != CONTRADICTS:
+        return answer
+    if answer.verdict in (Verdict.UNREADABLE, Verdict.NO_FEATURES):
+        return answer
+    first = replace(answer.matches[0], accepted=False)
+    return Answer((first, *answer.matches[1:]), answer.evidence, 0.0, Verdict.ELSEWHERE)
+
+
+def _accept_streaks(answers: Sequence[Answer], motion: Motion) -> list[Answer]:
+    """Accept the answers that end a streak of neighbouring places which odometry expects, each with enough inliers."""
+
+    def expected(row: int, answer: Answer) -> int:
+        if not answer.matches:
+            return -1
+        first, most = answer.matches[0], max(answer.matches, key=lambda match: match.inliers)
+        beside = abs(most.place - first.place) <= STREAK_STEP  # along a way the best place may be a neighbour
+        agrees = (motion.judge(row, np.array([first.place, most.place])) == AGREES).all()
+        return first.place if most.inliers >= STREAK_INLIERS and beside and agrees else -1
+
+    lengths = sequence.streaks(np.array([expected(row, answer) for row, answer in enumerate(answers)]), STREAK_STEP)
+    return [
+        replace(
+            answer,
+            matches=(replace(answer.matches[0], accepted=True), *answer.matches[1:]),
+            probability=max(answer.probability, confidence.ACCEPTED_FROM),
+            verdict=Verdict.ACCEPTED,
+        )
+        if length >= STREAK and answer.verdict is Verdict.UNSURE
+        else answer
+        for answer, length in zip(answers, lengths, strict=True)
+    ]
 
 
 def _evidence_along_ways(score: NDArray[np.float32]) -> NDArray[np.float64]:

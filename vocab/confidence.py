@@ -25,6 +25,7 @@ class Verdict(StrEnum):
     NO_FEATURES = "no_features"  # nothing in the image can be recognised
     FEW_INLIERS = "few_inliers"  # the most similar place shares too few features with it
     UNSURE = "unsure"  # the most similar place is too likely another one
+    ELSEWHERE = "elsewhere"  # odometry says that the camera is far from the most similar place
     DOUBT = "doubt"  # several places are about as good and cannot all be right
 
 

@@ -50,6 +50,20 @@ def _gather(unit: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
     return gathered
 
 
+def streaks(places: NDArray[np.integer], step: int) -> NDArray[np.int64]:
+    """Return for each query how many successive ones, itself the last, found places of one island: (n,).
+
+    ``places`` (n,) is the place that each query found, below 0 where it found none, which counts 0. Two places are of
+    one island where they are at most ``step`` apart (temporal consistency: Galvez-Lopez and Tardos, T-RO 2012).
+    """
+    found = places >= 0
+    goes_on = found[1:] & found[:-1] & (np.abs(np.diff(places)) <= step)
+    lengths = found.astype(np.int64)
+    for i in np.flatnonzero(goes_on):
+        lengths[i + 1] = lengths[i] + 1
+    return lengths
+
+
 def reach(n: int) -> NDArray[np.float64]:
     """Return for each of ``n`` queries how many images, faded, :func:`along_ways` sums over: (n,)."""
     past = (1 - MEMORY ** (np.arange(n) + 1)) / (1 - MEMORY)

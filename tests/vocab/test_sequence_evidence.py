@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from seamark.vocab import confidence
-from seamark.vocab.sequence import MEMORY, UNEVEN_STEP, along_ways, reach
+from seamark.vocab.sequence import MEMORY, UNEVEN_STEP, along_ways, reach, streaks
 
 
 def test_equals_the_best_of_all_ways_counted_one_by_one() -> None:
@@ -75,3 +75,10 @@ def test_doubt_grows_with_the_number_of_equals() -> None:
     assert confidence.doubt([0.4, 0.4]) == pytest.approx(0.2 * np.log(2))
     assert 0 < confidence.doubt([0.4, 0.3]) < 0.01
     assert confidence.doubt([0.5] * 20) == pytest.approx(0.2 * np.log(20))
+
+
+def test_a_streak_lasts_while_neighbours_are_found() -> None:
+    found = np.array([-1, 5, 6, 9, 14, 13, -1, 13, 12, 8, 8])
+    assert streaks(found, 4).tolist() == [0, 1, 2, 3, 1, 2, 0, 1, 2, 3, 4]
+    assert streaks(found, 0).tolist() == [0, 1, 1, 1, 1, 1, 0, 1, 1, 1, 2]
+    assert streaks(np.zeros(0, np.int64), 3).tolist() == []
