@@ -14,6 +14,18 @@ _Block: TypeAlias = tuple[
 
 def levels() -> list[str]: ...
 def top(scores: NDArray[np.float32], k: int) -> NDArray[np.int32]: ...
+def mutual(rows: NDArray[np.uint8], columns: NDArray[np.uint8], level: str | None = None) -> NDArray[np.int32]: ...
+def similarity(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    to_x: NDArray[np.float32],
+    to_y: NDArray[np.float32],
+    log_scale: NDArray[np.float32],
+    turn: NDArray[np.float32],
+    tolerance: float,
+    scale_step: float,
+    most_turn: float,
+) -> NDArray[np.uint8]: ...
 
 class Quantiser:
     def __init__(

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.vocab.errors import ObservationError
+from seamark.vocab.kernels import native
 from seamark.vocab.vocabulary import check_descriptors
 
 MATCH_RATIO: Final = 0.8
@@ -20,6 +21,7 @@ SUPPORT_WEIGHT: Final = 1.0 / 30.0
 
 FEW_INLIERS: Final = 20.0  # with fewer inliers scale and warp are hardly measured and count less
 REFINEMENTS = 3
+PIXELS_APART = 1 << 32  # no image is so high
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,7 @@ def compare(query: LocalFeatures, place: LocalFeatures) -> SpatialEvidence:
         return SpatialEvidence(len(rows), 0)
     tolerance = TOLERANCE * place.diagonal
     a, b = _complex(query.points[rows]), _complex(place.points[columns])
-    inliers = _best_hypothesis(query, place, rows, columns, a, b, tolerance)
+    inliers = _best_hypothesis(query, place, rows, columns, tolerance)
     similarity = 1.0 + 0.0j
     for _ in range(REFINEMENTS):
         if inliers.sum() < 3:
@@ -110,19 +112,18 @@ def _best_hypothesis(
     place: LocalFeatures,
     rows: NDArray[np.int64],
     columns: NDArray[np.int64],
-    a: NDArray[np.complex128],
-    b: NDArray[np.complex128],
     tolerance: float,
 ) -> NDArray[np.bool_]:
     """Return the matches (M,) that agree with the match that most agree with."""
-    log_scale = np.log(place.scales[columns].astype(np.float64)) - np.log(query.scales[rows].astype(np.float64))
+    log_scale = np.log(place.scales[columns]) - np.log(query.scales[rows])
     turn = (place.angles[columns] - query.angles[rows] + np.pi) % (2 * np.pi) - np.pi
-    similarity = np.exp(log_scale + 1j * turn)
-    error = np.abs(b[:, None] + similarity[:, None] * (a[None] - a[:, None]) - b[None])
-    agree = (error < tolerance) & (np.abs(log_scale[None] - log_scale[:, None]) < MAX_SCALE_STEP)
-    agree &= (np.abs(turn) < MAX_TURN)[:, None]
-    best: NDArray[np.bool_] = agree[agree.sum(axis=1).argmax()]
-    return best
+    here, there = query.points[rows], place.points[columns]
+    x, y, to_x, to_y, growth, spin = (
+        np.ascontiguousarray(values, np.float32)
+        for values in (here[:, 0], here[:, 1], there[:, 0], there[:, 1], log_scale, turn)
+    )
+    agree = native.similarity(x, y, to_x, to_y, growth, spin, tolerance, MAX_SCALE_STEP, MAX_TURN)
+    return agree.view(np.bool_)
 
 
 def _fit(
@@ -137,28 +138,17 @@ def _fit(
 
 
 def _distinct_matches(query: LocalFeatures, place: LocalFeatures) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of mutual nearest neighbours that pass the ratio test (Lowe 2004), one for each pixel.
-
-    Squared distances are exact, whatever the order of sums: whole numbers below 2^24 in float32.
-    """
+    """Return the indices of mutual nearest neighbours that pass the ratio test (Lowe 2004), one for each pixel."""
     if len(query.descriptors) < 2 or len(place.descriptors) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    a, b = query.descriptors.astype(np.float32), place.descriptors.astype(np.float32)
-    squared = a @ b.T
-    squared *= -2
-    squared += (a**2).sum(axis=1)[:, None]
-    squared += (b**2).sum(axis=1)[None]
-    rows, nearest = np.arange(len(a)), squared.argmin(axis=1)
-    mutual = squared.argmin(axis=0)[nearest] == rows
-    rows, columns = rows[mutual], nearest[mutual]
-    candidates = squared[rows]
-    first = candidates[np.arange(len(rows)), columns].copy()
-    candidates[np.arange(len(rows)), columns] = np.inf
-    quotient = first / np.maximum(candidates.min(axis=1), 1.0) if len(rows) else first
+    pairs = native.mutual(np.ascontiguousarray(query.descriptors), np.ascontiguousarray(place.descriptors))
+    rows, columns, first, second = pairs.T.astype(np.int64)
+    quotient = first / np.maximum(second, 1)
     keep = np.flatnonzero(quotient < MATCH_RATIO**2)
     keep = keep[np.argsort(quotient[keep], kind="stable")]  # of key points at one pixel the clearest match is kept
     for points, indices in ((query.points, rows), (place.points, columns)):
-        _, first_of_pixel = np.unique(np.round(points[indices[keep]]).astype(np.int64), axis=0, return_index=True)
+        pixels = np.round(points[indices[keep]]).astype(np.int64)
+        _, first_of_pixel = np.unique(pixels[:, 0] * PIXELS_APART + pixels[:, 1], return_index=True)
         keep = keep[np.sort(first_of_pixel)]
     return rows[keep], columns[keep]
 

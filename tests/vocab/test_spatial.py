@@ -4,9 +4,60 @@ import numpy as np
 import pytest
 
 from seamark.vocab.errors import ObservationError
+from seamark.vocab.kernels import native
 from seamark.vocab.spatial import LocalFeatures, compare
 
 WIDTH, HEIGHT = 640, 480
+TOLERANCE, SCALE_STEP, MOST_TURN = 40.0, 0.7, 0.5
+
+
+def mutual_reference(rows: np.ndarray, columns: np.ndarray) -> list[list[int]]:
+    """Mutual nearest neighbours with the distance to the nearest and to the next, from all distances."""
+    squared = ((rows[:, None].astype(int) - columns[None]) ** 2).sum(axis=2)
+    nearest, back = squared.argmin(axis=1), squared.argmin(axis=0)
+    ordered = np.sort(squared, axis=1)
+    return [[i, int(j), int(ordered[i, 0]), int(ordered[i, 1])] for i, j in enumerate(nearest) if back[j] == i]
+
+
+@pytest.mark.parametrize("level", native.levels())
+@pytest.mark.parametrize(("n", "m"), [(1, 2), (3, 17), (70, 64), (33, 300)])
+def test_mutual_neighbours_equal_those_of_all_distances(level: str, n: int, m: int) -> None:
+    rng = np.random.default_rng(n + m)
+    columns = rng.integers(0, 256, (m, 128), dtype=np.uint8)
+    rows = rng.integers(0, 256, (n, 128), dtype=np.uint8)
+    rows[: min(n, m) // 2] = columns[: min(n, m) // 2] ^ rng.integers(0, 8, (min(n, m) // 2, 128), dtype=np.uint8)
+    rows[n // 2 : n // 2 + 2] = columns[0]  # equally near: the first counts
+    assert native.mutual(rows, columns, level).tolist() == mutual_reference(rows, columns)
+
+
+def test_the_similarity_is_the_one_that_most_agree_with() -> None:
+    rng = np.random.default_rng(3)
+    for count in (0, 1, 2, 60):
+        x, y, to_x, to_y = rng.uniform(0, 500, (4, count)).astype(np.float32)
+        log_scale, turn = rng.normal(0, 0.5, count).astype(np.float32), rng.normal(0, 0.4, count).astype(np.float32)
+        together = count // 3
+        to_x[:together], to_y[:together] = 1.2 * x[:together] + 30, 1.2 * y[:together] - 8
+        log_scale[:together], turn[:together] = np.log(1.2), 0.0
+        here, there = x + 1j * y.astype(np.complex128), to_x + 1j * to_y.astype(np.complex128)
+        factor = np.exp(log_scale + 1j * turn.astype(np.complex128))
+        error = np.abs(there[:, None] + factor[:, None] * (here[None] - here[:, None]) - there[None])
+        agree = (error < TOLERANCE) & (np.abs(log_scale[:, None] - log_scale[None]) < SCALE_STEP)
+        agree &= (np.abs(turn) < MOST_TURN)[:, None]
+        expected = agree[agree.sum(axis=1).argmax()] if count else np.zeros(0, np.bool_)
+        found = native.similarity(x, y, to_x, to_y, log_scale, turn, TOLERANCE, SCALE_STEP, MOST_TURN)
+        assert found.astype(bool).tolist() == expected.tolist() and found.sum() >= together
+    nowhere = native.similarity(*[np.ones(2, np.float32)] * 6, TOLERANCE, SCALE_STEP, MOST_TURN)
+    assert nowhere.tolist() == [0, 0]  # every feature is turned too far
+
+
+def test_the_kernels_refuse_what_does_not_fit() -> None:
+    some = np.zeros((3, 128), np.uint8)
+    assert native.mutual(some[:0], some).shape == (0, 4)
+    for rows, columns in ((some, some[:1]), (some[:, :64], some)):
+        with pytest.raises((ValueError, TypeError)):
+            native.mutual(rows, columns)
+    with pytest.raises(ValueError, match="one length"):
+        native.similarity(*[np.zeros(4, np.float32)] * 5, np.zeros(3, np.float32), 1.0, 1.0, 1.0)
 
 
 def features(seed: int, count: int = 120) -> LocalFeatures:

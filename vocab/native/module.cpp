@@ -13,6 +13,7 @@
 #include <string>
 #include <tuple>
 
+#include "matching.hpp"
 #include "postings.hpp"
 #include "quantiser.hpp"
 
@@ -83,6 +84,40 @@ std::tuple<Out<int32_t, nb::ndim<2>>, Out<int32_t, nb::ndim<2>>> assign(const Qu
     const auto width = static_cast<size_t>(k);
     return {give<int32_t, nb::ndim<2>>(std::move(words), {n, width}),
             give<int32_t, nb::ndim<2>>(std::move(distances), {n, width})};
+}
+
+// (pairs, 4) int32: row, column, squared distance of the pair, and of the row to the column next after it.
+Out<int32_t, nb::ndim<2>> mutual(const Descriptors& rows, const Descriptors& columns,
+                                 const std::optional<std::string>& level) {
+    require(columns.shape(0) >= 2, "at least two columns are needed");
+    const Kernels& kernels = kernels_named(level);
+    std::vector<int32_t> values;
+    size_t n = 0;
+    {
+        nb::gil_scoped_release free;
+        const std::vector<Pair> pairs = mutual_nearest(rows.data(), static_cast<int64_t>(rows.shape(0)), columns.data(),
+                                                       static_cast<int64_t>(columns.shape(0)), kernels);
+        n = pairs.size();
+        values.reserve(4 * n);
+        for (const Pair& pair : pairs) values.insert(values.end(), {pair.row, pair.column, pair.nearest, pair.next});
+    }
+    return give<int32_t, nb::ndim<2>>(std::move(values), {n, 4});
+}
+
+Out<uint8_t, nb::ndim<1>> similarity(const In<float>& x, const In<float>& y, const In<float>& to_x,
+                                     const In<float>& to_y, const In<float>& log_scale, const In<float>& turn,
+                                     float tolerance, float scale_step, float most_turn) {
+    const size_t m = x.shape(0);
+    for (const In<float>* each : {&y, &to_x, &to_y, &log_scale, &turn})
+        require(each->shape(0) == m, "all arrays must be of one length");
+    const Matches matches{x.data(), y.data(), to_x.data(), to_y.data(), log_scale.data(), turn.data(),
+                          static_cast<int64_t>(m)};
+    std::vector<uint8_t> marks;
+    {
+        nb::gil_scoped_release free;
+        marks = best_similarity(matches, tolerance, scale_step, most_turn);
+    }
+    return give<uint8_t, nb::ndim<1>>(std::move(marks), {m});
 }
 
 void require_words(const In<int32_t>& words, int64_t n_words) {
@@ -240,6 +275,10 @@ NB_MODULE(_native, m) {
     using namespace seamark;
     m.doc() = "Kernels of the vocabulary: nearest words and posting lists. The GIL is released in all of them.";
     m.def("levels", &levels);
+
+    m.def("mutual", &mutual, "rows"_a, "columns"_a, "level"_a = nb::none());
+    m.def("similarity", &similarity, "x"_a, "y"_a, "to_x"_a, "to_y"_a, "log_scale"_a, "turn"_a, "tolerance"_a,
+          "scale_step"_a, "most_turn"_a);
 
     nb::class_<Quantiser>(m, "Quantiser")
         .def("__init__",

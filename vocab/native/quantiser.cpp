@@ -14,12 +14,6 @@ constexpr int32_t kNever = std::numeric_limits<int32_t>::max() / 2;  // 2 sum w 
 constexpr int32_t kAnywhere = std::numeric_limits<int32_t>::max();
 constexpr int64_t kBatch = 16384;                                    // descriptors that are sorted by cell at a time
 
-int32_t square(const uint8_t* descriptor) {
-    int32_t sum = 0;
-    for (int j = 0; j < kDescriptorSize; ++j) sum += descriptor[j] * descriptor[j];
-    return sum;
-}
-
 // Keeps the k nearest in order; `out` is full of candidates or of words -1, which are farther than any.
 void insert(Near candidate, int k, Near* out) {
     if (!(candidate < out[k - 1])) return;
@@ -29,6 +23,12 @@ void insert(Near candidate, int k, Near* out) {
 }
 
 }  // namespace
+
+int32_t square(const uint8_t* descriptor) {
+    int32_t sum = 0;
+    for (int j = 0; j < kDescriptorSize; ++j) sum += descriptor[j] * descriptor[j];
+    return sum;
+}
 
 void Grouped::Free::operator()(uint8_t* bytes) const { std::free(bytes); }
 

@@ -17,6 +17,9 @@ struct Near {
     }
 };
 
+// The sum of the squares of a descriptor's 128 bytes.
+int32_t square(const uint8_t* descriptor);
+
 // Descriptors of 128 bytes laid out in groups of sixteen, filled up with words that are never nearest.
 class Grouped {
 public:
