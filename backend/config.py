@@ -22,12 +22,15 @@ class VerificationConfig(_Section):
     confidence: float = Field(default=0.9999, gt=0, lt=1, description="confidence at which sampling stops")
     iterations: int = Field(default=2000, ge=100, description="most samples drawn")
     min_inliers: int = Field(default=15, ge=6, description="inliers of a pose below which it is refused")
-    min_inlier_ratio: float = Field(default=0.15, ge=0, le=1, description="inliers of a pose per match with depth")
+    min_inlier_ratio: float = Field(default=0.25, ge=0, le=1, description="inliers of a pose per match with depth")
+    min_confirmed: float = Field(
+        default=0.12, ge=0, le=1, description="share of the landmarks that a pose predicts which must be seen again"
+    )
     min_explained: float = Field(
-        default=0.5, ge=0, le=1, description="share of the matches without depth that a pose must explain"
+        default=0.65, ge=0, le=1, description="share of the matches without depth that a pose must explain"
     )
     max_rotation_sigma_deg: float = Field(
-        default=2.0, gt=0, description="deviation of a pose's rotation, in its worst direction, that is refused"
+        default=1.0, gt=0, description="deviation of a pose's rotation, in its worst direction, that is refused"
     )
     max_translation_sigma_fraction: float = Field(
         default=0.05, gt=0, description="the same of its translation, per median depth of what is seen"

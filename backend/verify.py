@@ -125,12 +125,13 @@ def _verify_pose(trial: _Trial, seed: int) -> Verification | Rejected:
         return trial.rejected(Reason.BAD_GEOMETRY)
     explained, others = explained_without_depth(refined.T_match_query, seen, config.reprojection_px)
     trial.explained = explained
-    # Smoothed, so that one or two matches decide nothing.
+    # Shares are smoothed, so that one or two matches decide nothing.
     if not trial.passes("explained_without_depth", (explained.sum() + 2) / (others.sum() + 2), config.min_explained):
         return trial.rejected(Reason.CONTRADICTED)
     sight = _look(trial, refined, best.in_query_units)
     trial.missing = sight.pixels[sight.found < 0].astype(np.float32) if not best.in_query_units else trial.missing
-    trial.passes("confirmed", sight.confirmed / max(sight.expected, 1), 0.0)
+    if not trial.passes("confirmed", (sight.confirmed + 2) / (sight.expected + 2), config.min_confirmed):
+        return trial.rejected(Reason.CONTRADICTED)
     T_match_query, covariance, scale, scale_sigma = refined.T_match_query, refined.covariance.copy(), 1.0, 1e-3
     if not metric:
         X_query, X_match = _landmarks(query)[trial.matches.query], _landmarks(match)[trial.matches.match]
