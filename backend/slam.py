@@ -18,7 +18,7 @@ from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
 from seamark.backend.likelihood import probability
 from seamark.backend.map_state import MapState
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
-from seamark.backend.verify import Rejected, Verification, verify
+from seamark.backend.verify import Rejected, Verification, pair_seed, verify
 from seamark.frontend.types import Keyframe, Mode
 from seamark.vocab.types import Candidate, Candidates
 
@@ -127,7 +127,7 @@ class Slam:
         places = []
         for candidate in self._islands(candidates, known, None):
             match = known[candidate.id]
-            result = verify(query, match, self._config.verification, self._pair_seed(query.id, match.id))
+            result = verify(query, match, self._config.verification, pair_seed(self._seed, query.id, match.id))
             likely = probability(query, match, candidate.score)
             places.append(self._place(candidate, match, result, likely))
         return tuple(sorted(places, key=lambda place: (not place.accepted, -place.inliers)))
@@ -158,7 +158,7 @@ class Slam:
         """Compare the keyframe with the best candidate of each island."""
         verified = []
         for candidate in self._islands(candidates, self._map.keyframes, keyframe):
-            match, seed = self._map.keyframes[candidate.id], self._pair_seed(keyframe.id, candidate.id)
+            match, seed = self._map.keyframes[candidate.id], pair_seed(self._seed, keyframe.id, candidate.id)
             verified.append((candidate, verify(keyframe, match, self._config.verification, seed)))
         return verified if self._solver is not None else self._best_of_islands(verified)
 
@@ -291,7 +291,3 @@ class Slam:
             view=candidate.view,
             probability=likely,
         )
-
-    def _pair_seed(self, query_id: int, match_id: int) -> int:
-        """Return a seed for one pair, so that the result does not depend on what was verified before."""
-        return (self._seed * 1_000_003 + (query_id + 2) * 7_919 + match_id) & 0x7FFFFFFF

@@ -73,6 +73,11 @@ def verify(query: Keyframe, match: Keyframe, config: VerificationConfig, seed: i
     return _verify_pose(trial, seed)
 
 
+def pair_seed(seed: int, query_id: int, match_id: int) -> int:
+    """Return a seed for one pair, so that a result does not depend on what was verified before."""
+    return (seed * 1_000_003 + (query_id + 2) * 7_919 + match_id) & 0x7FFFFFFF
+
+
 class _Trial:
     """One comparison on its way through the gates."""
 

@@ -10,6 +10,7 @@ import typer
 
 from seamark import SeamarkError, __version__
 from seamark.service.graph_commands import graph_app
+from seamark.service.loop_commands import loops_command
 from seamark.service.map_commands import map_app
 from seamark.service.places_commands import places_app
 from seamark.service.terminal import Bar, errors, print_json, print_table
@@ -36,6 +37,7 @@ app.add_typer(synth_app, name="synth")
 app.add_typer(graph_app, name="graph")
 app.add_typer(places_app, name="places")
 app.add_typer(map_app, name="map")
+map_app.command("loops")(loops_command)
 
 Sources = Annotated[list[str], typer.Argument(help="Folders, videos or synth:NAME, taken one after another.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
