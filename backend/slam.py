@@ -11,6 +11,7 @@ from seamark.backend.chain import OdometryChains
 from seamark.backend.config import BackendConfig
 from seamark.backend.consistency import gate_chi2
 from seamark.backend.errors import BackendInputError
+from seamark.backend.evidence import Evidence, Gate
 from seamark.backend.graph_types import Constraint, Node, Solver, check_node
 from seamark.backend.judge import PoseJudge
 from seamark.backend.judge_places import PlaceJudge
@@ -57,6 +58,7 @@ class Slam:
         self._map = MapState()
         self._loops: dict[Key, Loop] = {}
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
+        self._evidence: dict[Key, Evidence | None] = {}  # of the last step; all of it would be memory without bound
         self._lock = threading.Lock()
 
     def __contains__(self, keyframe_id: int) -> bool:
@@ -68,6 +70,7 @@ class Slam:
         timings_ms = {}
         # Hang the keyframe on its predecessor by odometry.
         self._add(keyframe)
+        self._evidence = {}
 
         # Verify one candidate per island of neighbouring keyframes, the best first.
         started = time.perf_counter()
@@ -85,8 +88,7 @@ class Slam:
         started = time.perf_counter()
         optimised = self._commit([key for key in changed if self._loops[key].accepted != (key in self._committed)])
         timings_ms["optimise"] = 1e3 * (time.perf_counter() - started)
-        evidence = {(keyframe.id, candidate.id): result.evidence for candidate, result in verified}
-        loops = tuple(replace(self._loops[key], evidence=evidence.get(key)) for key in changed)
+        loops = tuple(replace(self._loops[key], evidence=self._evidence.get(key)) for key in changed)
         return StepResult(loops, self._map.revision, optimised, timings_ms)
 
     def finish(self) -> StepResult:
@@ -206,6 +208,7 @@ class Slam:
     def _enter(self, keyframe: Keyframe, candidate: Candidate, result: Verification | Rejected) -> list[Key]:
         """Write the loop's row with its verdict; return the rows that are new or changed."""
         key = (keyframe.id, candidate.id)
+        self._evidence[key] = result.evidence
         loop = Loop(
             *key, False, Reason.UNCONFIRMED, result.inliers, candidate.score, candidate.votes, candidate.jeffrey
         )
@@ -218,7 +221,10 @@ class Slam:
         finding = self._finding_of(loop, result.scale_sigma)
         if finding.constraint is not None and finding.query_session == finding.match_session:
             chi2 = gate_chi2(finding.constraint, self._chains)
-            if not chi2 <= self._config.consistency.gate_chi2:
+            gate = Gate("odometry_chi2", chi2, self._config.consistency.gate_chi2, least=False)
+            if result.evidence is not None:
+                self._evidence[key] = replace(result.evidence, gates=(*result.evidence.gates, gate))
+            if not gate.passed:
                 return self._write(replace(loop, reason=Reason.ODOMETRY_DISAGREES))
         keys = self._write(loop)
         for changed_key, reason in self._ledger.add(finding).items():

@@ -163,6 +163,9 @@ def test_a_place_that_odometry_excludes_is_refused(world, move):
     (loop,) = slam.step(impostor, candidates(12, 2)).loops
     assert (loop.accepted, loop.reason) == (False, Reason.ODOMETRY_DISAGREES)
     assert loop.inliers > 100
+    failed = [gate.name for gate in loop.evidence.gates if not gate.passed]
+    assert failed == ["odometry_chi2"]
+    assert slam.snapshot().loops[0].evidence is None  # memory would grow with it
 
 
 def test_neighbours_of_a_verified_candidate_and_the_recent_past_are_skipped(world, move):
