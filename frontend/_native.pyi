@@ -26,6 +26,13 @@ def follow(
     back_top: int,
     level: str | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
+def strongest(
+    image: NDArray[np.uint8], cell: int, border: int, harris_k: float, mask: NDArray[np.uint8] | None
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]: ...
+def median_difference(image: NDArray[np.uint8]) -> float: ...
+def apart(
+    points: NDArray[np.float32], others: NDArray[np.float32], distance: float, to_each_other: bool
+) -> NDArray[np.bool_]: ...
 def align_along(
     source: Pyramid,
     target: Pyramid,

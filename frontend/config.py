@@ -23,7 +23,7 @@ class FrontendConfig(BaseModel):
     flow_levels: int = Field(4, ge=0, le=8, description="highest level of the Lucas-Kanade pyramid")
     flow_round_trip_px: float = Field(0.8, gt=0, description="forward-backward distance that a good track stays under")
     flow_min_correlation: float = Field(
-        0.5, ge=-1, le=1, description="zero-mean normalised correlation of a good track's patch with the one before"
+        0.4, ge=-1, le=1, description="zero-mean normalised correlation of a good track's patch with the one before"
     )
 
     # Motion

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from seamark.frontend import flow, se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.kernels import native
 from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.window import WindowKeyframe
@@ -74,6 +75,5 @@ def find_again(
         min_correlation=config.flow_min_correlation,
     )
     ok &= np.linalg.norm(there - expected, axis=1) < config.revisit_search_px
-    if len(live):
-        ok &= np.linalg.norm(there[:, None] - live.pixels[None], axis=2).min(axis=1) > CROWDED_PX
+    ok &= native.apart(there, live.pixels, CROWDED_PX, to_each_other=False)
     return Tracks(old.track_ids[rows[ok]], there[ok])

@@ -7,12 +7,14 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <optional>
 #include <stdexcept>
 #include <string>
 #include <tuple>
 #include <vector>
 
+#include "corners.hpp"
 #include "flow.hpp"
 #include "patches.hpp"
 #include "pose.hpp"
@@ -71,6 +73,47 @@ nb::ndarray<nb::numpy, const uint8_t, nb::ndim<2>> level_of(const Pyramid& pyram
     require(level >= 0 && level <= pyramid.top(), "a pyramid has no such level");
     const Level& of = pyramid[level];
     return {of.pixels, {static_cast<size_t>(of.height), static_cast<size_t>(of.width)}, nb::find(&pyramid), {of.stride, 1}};
+}
+
+using Rows = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
+
+Level level_with(const Rows& image) {
+    require(image.shape(0) > 0 && image.shape(1) > 0, "an image needs pixels");
+    require(image.shape(0) < 32768 && image.shape(1) < 32768, "an image has less than 32768 rows and columns");
+    require(image.stride(1) == 1 && image.stride(0) >= 0, "the pixels of a row lie side by side");
+    return {image.data(), image.stride(0), static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0))};
+}
+
+std::tuple<Out<int32_t, -1, 2>, Out<float, -1>> strongest_of(const Rows& image, int cell, int border, float harris_k,
+                                                             const std::optional<Grey>& mask) {
+    const Level grey = level_with(image);
+    require(cell > 0 && border >= 3, "a grid has cells, and corners lie 3 pixels inside at least");
+    require(!mask || (static_cast<int>(mask->shape(0)) == grey.height && static_cast<int>(mask->shape(1)) == grey.width),
+            "a mask has the size of its image");
+    const Grid grid = {cell, grey.height / cell, grey.width / cell, border};
+    const size_t n = static_cast<size_t>(grid.rows) * grid.columns;
+    std::vector<float> strength(n);
+    std::vector<int32_t> pixels(2 * n);
+    if (std::min(grey.height, grey.width) > 2 * border) {
+        nb::gil_scoped_release free;
+        strongest(grey, grid, harris_k, mask ? mask->data() : nullptr, strength.data(), pixels.data());
+    }
+    return {give<int32_t, -1, 2>(std::move(pixels), {n, 2}), give<float, -1>(std::move(strength), {n})};
+}
+
+using Flags = nb::ndarray<nb::numpy, bool, nb::shape<-1>>;
+
+Flags give_flags(bool* flags, size_t n) {
+    nb::capsule owner(flags, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
+    return Flags(flags, {n}, owner);
+}
+
+Flags apart_from(const Pixels& points, const Pixels& others, float distance, bool to_each_other) {
+    const size_t n = points.shape(0);
+    auto* flags = new bool[n];
+    apart(points.data(), static_cast<int64_t>(n), others.data(), static_cast<int64_t>(others.shape(0)), distance,
+          to_each_other, flags);
+    return give_flags(flags, n);
 }
 
 const FlowKernels& flow_kernels_named(const std::optional<std::string>& level) {
@@ -146,7 +189,7 @@ std::optional<std::tuple<Out<double, 4, 4>, Out<double, 6, 6>, Out<double, -1>>>
                            give<double, -1>(std::move(errors), {n}));
 }
 
-std::tuple<Out<double, -1>, nb::ndarray<nb::numpy, bool, nb::shape<-1>>> errors_of(
+std::tuple<Out<double, -1>, Flags> errors_of(
     const Pose& T, const Points& positions, const In<double, -1, 2>& pixels, const Vector& inverse_depth,
     const Vector& inverse_sigma, const std::optional<Vector>& spread, const std::optional<In<double, 3>>& origin,
     const Four& camera, double pixel_sigma, double nearest_m) {
@@ -155,13 +198,11 @@ std::tuple<Out<double, -1>, nb::ndarray<nb::numpy, bool, nb::shape<-1>>> errors_
     const Landmarks landmarks = landmarks_of(positions, spread, origin);
     std::vector<double> errors(n);
     auto* in_front = new bool[n];
-    nb::capsule owner(in_front, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
     {
         nb::gil_scoped_release free;
         pixel_errors(T.data(), landmarks, seen, lens_of(camera, pixel_sigma), nearest_m, errors.data(), in_front);
     }
-    return {give<double, -1>(std::move(errors), {n}),
-            nb::ndarray<nb::numpy, bool, nb::shape<-1>>(in_front, {n}, owner)};
+    return {give<double, -1>(std::move(errors), {n}), give_flags(in_front, n)};
 }
 
 void check(const Bundle& bundle, const In<int64_t, -1>& keyframe_of, const In<int64_t, -1>& landmark_of) {
@@ -220,6 +261,10 @@ NB_MODULE(_native, m) {
         .def("level", &level_of, "level"_a);
     m.def("follow", &followed, "before"_a, "after"_a, "points"_a, "start"_a, "side"_a, "top"_a, "back_top"_a,
           "level"_a = nb::none());
+    m.def("strongest", &strongest_of, "image"_a.noconvert(), "cell"_a, "border"_a, "harris_k"_a, "mask"_a.noconvert().none());
+    m.def("median_difference", [](const Rows& image) { return median_difference(level_with(image)); },
+          "image"_a.noconvert());
+    m.def("apart", &apart_from, "points"_a, "others"_a, "distance"_a, "to_each_other"_a);
     m.def(
         "align_along",
         [](const Pyramid& source, const Pyramid& target, const Pixels& points, const Pixels& start,
