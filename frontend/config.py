@@ -61,9 +61,13 @@ class FrontendConfig(BaseModel):
     window_keyframes: int = Field(8, ge=3, le=30, description="keyframes adjusted together")
     window_iterations: int = Field(6, ge=1, le=50, description="Levenberg-Marquardt steps at most")
 
+    covisible_keyframes: int = Field(
+        8, ge=0, le=30, description="keyframes that have left the window, share its landmarks and hold it"
+    )
+
     # Earlier keyframes, seen again
     archive_keyframes: int = Field(60, ge=0, le=1000, description="keyframes kept with their image after the window")
-    revisit_keyframes: int = Field(3, ge=0, le=20, description="archived keyframes tried at a new keyframe")
+    revisit_keyframes: int = Field(3, ge=0, le=20, description="earlier keyframes tried at a new keyframe")
     revisit_angle_deg: float = Field(20.0, gt=0, description="largest turn against an archived keyframe")
     revisit_step: float = Field(0.3, gt=0, description="largest distance from one, per median depth of the scene")
     revisit_search_px: float = Field(15.0, gt=0, description="how far from its expected pixel a landmark may be found")

@@ -10,7 +10,7 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import grey_of
 from seamark.frontend.keyframes import KeyframeBuilder
-from seamark.frontend.pose import estimate_pose, motion_covariance
+from seamark.frontend.pose import estimate_pose
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
 from seamark.frontend.tracks import Tracks
@@ -122,7 +122,7 @@ def insert_first_keyframes(
     )
     session.velocity = np.eye(4)
     session.last_pose_stamp_ns = frame.stamp_ns
-    covariance = motion_covariance(T_odom_first, session.T_odom_cam, np.zeros((6, 6)))
+    covariance = session.motion_since(T_odom_first, None)
     b = builder.request(frame, session.id, a.id, session.T_odom_cam, covariance)
     builder.submit([a, b])
     return initialiser.fill(session, a.id, T_odom_first)

@@ -19,11 +19,11 @@ from seamark.frontend.loss import MIN_CORNERS, loss_of
 from seamark.frontend.masks import allowed, combined, read_mask
 from seamark.frontend.monocular import MonoInitialiser, insert_first_keyframes
 from seamark.frontend.motion_mask import MotionMasks
-from seamark.frontend.pose import PoseEstimate, motion_covariance
+from seamark.frontend.pose import PoseEstimate
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.recovery import recover
 from seamark.frontend.session import Session
-from seamark.frontend.tracks import TrackAges, Tracks
+from seamark.frontend.tracks import Tracks
 from seamark.frontend.types import Frame, Keyframe, Mode, Odometry, Outcome, Quality, Rig
 
 
@@ -75,7 +75,6 @@ class Frontend:
         self._stamps = StampGate(mode, config)
         camera = rig.cam0 if rig is not None and mode is not Mode.PLACES else None
         self._mask = read_mask(config.mask_file, camera) if config.mask_file is not None else None
-        self._ages = TrackAges()
         self._motion: MotionMasks | None = None
         self._next_session = 0
         self._T_odom_start = se3.T_WORLD_LEVEL_CAM.copy()
@@ -136,20 +135,20 @@ class Frontend:
         watch.lap("settle")
 
         session.move(frame.stamp_ns, pose.T_odom_cam, tracks[keep])
-        ages = self._ages.step(session.id, session.tracks.ids)
+        ages = session.ages.of(session.tracks.ids)
         moving = (
             self._motion.step(image.grey, frame.stamp_ns, pose.T_odom_cam, session.distance()) if self._motion else None
         )
         keyframe_id = None
         if tracker.keyframe_due(session, frame.stamp_ns, int(pose.inliers.sum())):
-            keyframe_id = self._insert_keyframe(session, frame, image, pose.covariance)
+            keyframe_id = self._insert_keyframe(session, frame, image, pose)
             watch.lap("keyframe")
         arrows = np.hstack([tracks.pixels, was])[keep]
         odometry = self._tracked(session, frame, pose, Outcome.TRACKED, keyframe_id, arrows, watch.stages_ms)
         return replace(odometry, track_ages=ages, motion_mask=moving)
 
     def _insert_keyframe(
-        self, session: Session, frame: Frame, image: Pyramid, covariance: NDArray[np.float64] | None
+        self, session: Session, frame: Frame, image: Pyramid, estimate: PoseEstimate | None
     ) -> int | None:
         """Make the current frame a keyframe: new corners and depths, the window adjusted, its content under way.
 
@@ -164,8 +163,8 @@ class Frontend:
         if keyframe_id is None:
             return None
         motion = None
-        if previous is not None and covariance is not None:
-            motion = motion_covariance(previous.T_odom_cam, session.T_odom_cam, covariance)
+        if previous is not None and estimate is not None:
+            motion = session.motion_since(previous.T_odom_cam, estimate)
         request = self._builder.request(
             frame, session.id, previous.id if previous else None, session.T_odom_cam, motion, session.depth_offset
         )
@@ -248,7 +247,7 @@ class Frontend:
             session.landmarks.set(fresh.ids, found.landmarks, found.spread)
             session.move(frame.stamp_ns, found.estimate.T_odom_cam, session.tracks)
             session.velocity = np.eye(4)
-            keyframe_id = self._insert_keyframe(session, frame, image, found.estimate.covariance)
+            keyframe_id = self._insert_keyframe(session, frame, image, found.estimate)
             arrows = np.hstack([found.pixels, found.pixels])
             return self._tracked(session, frame, found.estimate, Outcome.RECOVERED, keyframe_id, arrows, {})
         session.velocity = np.eye(4)
@@ -291,7 +290,7 @@ class Frontend:
             T_odom_cam=session.T_odom_cam,
             reference_id=reference.id,
             T_reference_cam=se3.inverse(reference.T_odom_cam) @ session.T_odom_cam,
-            covariance=motion_covariance(reference.T_odom_cam, session.T_odom_cam, pose.covariance),
+            covariance=session.motion_since(reference.T_odom_cam, pose),
             keyframe_id=keyframe_id,
             tracks=arrows,
             stages_ms=stages_ms,

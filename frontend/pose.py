@@ -15,15 +15,17 @@ from seamark.frontend.residuals import Observations, residuals_and_jacobian, shi
 ITERATIONS = 8
 CONVERGED = 1e-7
 NEAREST_M = 1e-3
+CONTESTED_SHARE = 0.8  # of all votes: where fewer agree with a pose, others are asked for
 
 Array: TypeAlias = NDArray[np.float64]
 
-# Shared errors of landmarks over one keyframe step: see motion_covariance.
-ROTATION_FLOOR = 5e-4
-ROTATION_PER_RADIAN = 0.005
-ROTATION_PER_METRE = 0.001
-TRANSLATION_FLOOR_M = 0.002
-TRANSLATION_SHARE = 0.01
+# Errors that the landmarks share over one keyframe step: see motion_covariance.
+TRACKING_PX = 0.22  # median error of landmarks that nothing but the noise of tracking moves
+SYSTEMATIC_SHARE = 2.0  # of what residuals exceed that by
+ROTATION_FLOOR = 2e-4
+ROTATION_PER_RADIAN = 0.002
+TRANSLATION_SHARE = 0.004
+MONO_TRANSLATION_SHARE = 0.03  # the scale drifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +55,14 @@ def estimate_pose(
     pixel_sigma: float,
     minimum: int,
     prediction: Prediction | None = None,
+    votes: NDArray[np.float64] | None = None,
 ) -> PoseEstimate | None:
     """Estimate the pose; None when fewer than ``minimum`` landmarks agree.
 
     P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`refine_pose` twice, the second time on the inliers of
     the refined pose. With a prediction, landmarks of uncertain distance take part: they hold the rotation, and the
-    translation across their line of sight.
+    translation across their line of sight. ``votes`` (N,) weigh the landmarks where they disagree: then what the others
+    agree on, and what is predicted, stand for election beside the largest consensus.
     """
     if len(observations.landmarks) < max(4, minimum):
         return None
@@ -68,7 +72,12 @@ def estimate_pose(
         if prediction is not None:
             starts.append((prediction.T_odom_cam, np.ones(len(observations.landmarks), bool)))
         sample = np.arange(len(observations.landmarks))
+    votes = np.ones(len(observations.landmarks)) if votes is None else votes
     starts += _sample_consensus(observations, sample, camera, threshold_px, iterations, minimum)
+    if starts and prediction is not None and votes[starts[-1][1]].sum() < CONTESTED_SHARE * votes.sum():
+        others = sample[~starts[-1][1][sample]]
+        starts.append((prediction.T_odom_cam, np.ones(len(observations.landmarks), bool)))
+        starts += _sample_consensus(observations, others, camera, threshold_px, iterations, minimum)
     best, best_score = None, np.inf
     for T_odom_cam, inliers in starts:
         found = _converge(
@@ -80,6 +89,7 @@ def estimate_pose(
             pixel_sigma=pixel_sigma,
             minimum=minimum,
             prediction=prediction,
+            votes=votes,
         )
         if found is not None and found[1] < best_score:
             best, best_score = found
@@ -95,6 +105,8 @@ def _sample_consensus(
     minimum: int,
 ) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
     """Return the pose that most of the sample agree on, with those (N,), or nothing when fewer than the minimum do."""
+    if len(sample) < max(4, minimum):
+        return []
     ok, rotation, translation, indices = cv2.solvePnPRansac(
         np.ascontiguousarray(observations.landmarks[sample]),
         np.ascontiguousarray(observations.pixels[sample]),
@@ -122,8 +134,9 @@ def _converge(
     pixel_sigma: float,
     minimum: int,
     prediction: Prediction | None,
+    votes: NDArray[np.float64],
 ) -> tuple[PoseEstimate, float] | None:
-    """Refine a pose on its inliers (N,), twice, as they change; return it with its truncated error."""
+    """Refine a pose on its inliers (N,), twice, as they change; return it with its truncated error, weighted."""
     covariance = np.eye(6)
     for _ in range(2):
         try:
@@ -136,7 +149,7 @@ def _converge(
         inliers = in_front & (errors < threshold_px)
         if inliers.sum() < minimum:
             return None
-    score = float(np.where(inliers, errors, threshold_px).sum())
+    score = float((votes * np.where(inliers, errors, threshold_px)).sum())
     return PoseEstimate(T_odom_cam, inliers, float(np.median(errors[inliers])), covariance), score
 
 
@@ -221,16 +234,27 @@ def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def motion_covariance(
-    T_odom_a: NDArray[np.float64], T_odom_b: NDArray[np.float64], covariance: NDArray[np.float64]
+    T_odom_a: NDArray[np.float64],
+    T_odom_b: NDArray[np.float64],
+    estimate: PoseEstimate | None,
+    *,
+    focal_px: float,
+    depth: float,
+    metric: bool,
 ) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of the motion from a to b, of which ``covariance`` is the estimator's own at b.
+    """Return the covariance (6, 6) of the motion from a to b, rotation first, of which ``estimate`` gave the pose b.
 
-    The estimator takes the landmarks for exact; what their shared errors add grows with the distance and the angle
-    moved.
+    The estimator takes landmarks for exact and errors of pixels for independent. Shutters that roll, depth that comes
+    late and calibrations that err move many pixels together: what the residuals exceed the noise of tracking by is
+    taken for such an angle, which ``depth``, the distance of the scene, turns into a translation. Errors of landmarks
+    add shares of the angle and the distance moved.
     """
     distance = float(np.linalg.norm(T_odom_b[:3, 3] - T_odom_a[:3, 3]))
     angle = float(se3.rotation_angle(T_odom_a[:3, :3].T @ T_odom_b[:3, :3]))
-    sigma_rotation = ROTATION_FLOOR + ROTATION_PER_RADIAN * angle + ROTATION_PER_METRE * distance
-    sigma_translation = TRANSLATION_FLOOR_M + TRANSLATION_SHARE * distance
-    shared = np.diag([sigma_rotation**2] * 3 + [sigma_translation**2] * 3)
-    return covariance + shared
+    excess_px = 0.0 if estimate is None else np.sqrt(max(0.0, estimate.reprojection_px**2 - TRACKING_PX**2))
+    systematic = SYSTEMATIC_SHARE * excess_px / focal_px
+    share = TRANSLATION_SHARE if metric else MONO_TRANSLATION_SHARE
+    sigma_rotation = np.hypot(systematic, ROTATION_FLOOR + ROTATION_PER_RADIAN * angle)
+    sigma_translation = np.hypot(depth * systematic, depth * ROTATION_FLOOR + share * distance)
+    own = np.zeros((6, 6)) if estimate is None else estimate.covariance
+    return own + np.diag([sigma_rotation**2] * 3 + [sigma_translation**2] * 3)

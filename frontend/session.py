@@ -1,6 +1,7 @@
 """One session's tracking state: live tracks, landmarks, and the window of recent keyframes."""
 
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +12,17 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.detectors import find_corners
 from seamark.frontend.masks import Mask
-from seamark.frontend.pose import Prediction
+from seamark.frontend.pose import PoseEstimate, Prediction, motion_covariance
 from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.residuals import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
-from seamark.frontend.tracks import Tracks
+from seamark.frontend.tracks import TrackAges, Tracks
 from seamark.frontend.two_view import normalised_rays, triangulate
 from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
 
 OUTLIER_PX = 4.0
+LIVE_KEYFRAMES = 2  # the newest of the window, whose landmarks are tracked still if they are seen
 TRIANGULATED_SPREAD = 0.2  # a distance less certain than this is triangulated anew where two views allow it
 NEAR_SPREAD = 0.1  # of the distance: what is known so well holds the translation
 PREDICTION_SHARE = 0.5  # of the last step and
@@ -52,6 +54,7 @@ class Session:
     last_pose_stamp_ns: int = 0
     n_at_keyframe: int = 0
     next_track_id: int = 0
+    ages: TrackAges = field(default_factory=TrackAges)
 
     @property
     def reference(self) -> WindowKeyframe:
@@ -74,6 +77,7 @@ class Session:
         self.velocity = se3.inverse(self.T_odom_cam) @ T_odom_cam
         self.T_odom_cam = T_odom_cam
         self.tracks = tracks
+        self.ages.step(tracks.ids)
         self.last_pose_stamp_ns = stamp_ns
 
     def observations(
@@ -101,6 +105,17 @@ class Session:
         distance = np.linalg.norm(positions[np.isfinite(positions[:, 0])] - self.T_odom_cam[:3, 3], axis=1)
         return float(np.median(distance)) if len(distance) else 1.0
 
+    def motion_since(self, T_odom_a: NDArray[np.float64], estimate: PoseEstimate | None) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of the motion from ``T_odom_a`` to the present pose, which was estimated so."""
+        return motion_covariance(
+            T_odom_a,
+            self.T_odom_cam,
+            estimate,
+            focal_px=self.camera.fx,
+            depth=self.distance(),
+            metric=self.metric,
+        )
+
     def near_share(self) -> float:
         """Return the share of the tracked landmarks whose distance is known to better than a tenth."""
         spread = self.landmarks.spread(self.tracks.ids)
@@ -108,19 +123,34 @@ class Session:
         return float((spread < NEAR_SPREAD).sum()) / known if known else 0.0
 
     def revisit(self, image: Pyramid) -> None:
-        """Take up landmarks of archived keyframes that the current image shows again."""
+        """Take up landmarks of earlier keyframes that the current image shows again."""
         self.anchors = []
         live = self.landmarks.get(self.tracks.ids)
         live = live[np.isfinite(live[:, 0])]
-        if not self.archive or len(live) == 0:
+        past = [*self.archive, *self.window[:-LIVE_KEYFRAMES]]
+        if not past or len(live) == 0:
             return
         depth = float(np.median(se3.transform(se3.inverse(self.T_odom_cam), live)[:, 2]))
-        for old in worth_revisiting(self.archive, self.T_odom_cam, depth, self.config):
+        for old in worth_revisiting(past, self.T_odom_cam, depth, self.config):
             positions = self.landmarks.get(old.track_ids)
             found = find_again(old, positions, image, self.T_odom_cam, self.camera, self.tracks, self.config)
             self.tracks = self.tracks + found
-            if np.isin(old.track_ids, self.tracks.ids).sum() >= self.config.revisit_min_landmarks:
+            if old.stamp_ns < self.window[0].stamp_ns and self._shares(old, self.tracks.ids):
                 self.anchors.append(old)
+
+    def _shares(self, old: WindowKeyframe, track_ids: NDArray[np.int64]) -> bool:
+        """Return whether a keyframe sees enough of these landmarks to hold what sees them."""
+        return int(np.isin(old.track_ids, track_ids).sum()) >= self.config.revisit_min_landmarks
+
+    def _held_still(self) -> list[WindowKeyframe]:
+        """Return the archived keyframes that hold the window: the anchors, and the newest that share its landmarks.
+
+        What has left the window is not forgotten: without it, scale and heading would hang on the oldest pose alone.
+        """
+        seen = np.unique(np.concatenate([k.track_ids for k in self.window]))
+        anchored = {k.stamp_ns for k in self.anchors}
+        others = (k for k in reversed(self.archive) if k.stamp_ns not in anchored and self._shares(k, seen))
+        return [*self.anchors, *islice(others, self.config.covisible_keyframes)]
 
     def insert_keyframe(
         self,
@@ -212,13 +242,14 @@ class Session:
             todo[mine[good]] = False
 
     def adjust_window(self) -> None:
-        """Bundle-adjust the window and forget landmarks that do not fit; anchors and the oldest poses hold the
-        gauge.
+        """Bundle-adjust the window and forget landmarks that do not fit; keyframes held still and the oldest poses
+        hold the gauge.
         """
         n_fixed = 1 if self.metric or len(self.window) == 2 else 2
         if len(self.window) <= n_fixed:
             return
-        problem, track_ids = self._bundle_problem([*self.anchors, *self.window], len(self.anchors) + n_fixed)
+        still = self._held_still()
+        problem, track_ids = self._bundle_problem([*still, *self.window], len(still) + n_fixed)
         if problem is None:
             return
         c = self.config
@@ -233,7 +264,7 @@ class Session:
         spread = np.sqrt(np.maximum(variance, 0)) / np.maximum((along * along).sum(axis=1), 1e-12)
         self.landmarks.set(track_ids, positions, spread)
         self.tracks = self.tracks[~np.isin(self.tracks.ids, track_ids[worst >= OUTLIER_PX])]
-        adjusted = result.poses[len(self.anchors) :]
+        adjusted = result.poses[len(still) :]
         self.window = [replace(k, T_odom_cam=T) for k, T in zip(self.window, adjusted, strict=True)]
         # each observation is in as many windows as there are keyframes in one
         self.mapped = next((k for k in self.window if self.mapped and k.id == self.mapped.id), self.mapped)

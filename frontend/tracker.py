@@ -10,6 +10,7 @@ from seamark.frontend.patches import align_warped
 from seamark.frontend.pose import PoseEstimate, estimate_pose
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
+from seamark.frontend.static_votes import static_votes
 from seamark.frontend.tone import match_tone
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.two_view import rotation_compensated_parallax
@@ -95,6 +96,7 @@ def estimate(
         pixel_sigma=c.pixel_sigma,
         minimum=c.min_inliers,
         prediction=session.prediction(),
+        votes=static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera),
     )
     keep = np.ones(len(tracks), bool)
     if pose is not None:
@@ -111,9 +113,8 @@ def settle(session: Session, image: Pyramid, tracks: Tracks, T_odom_cam: NDArray
     mine, theirs = mine[known], theirs[known]
     in_reference = se3.transform(se3.inverse(reference.T_odom_cam), positions[known])
     warps = patch_warps(se3.inverse(T_odom_cam) @ reference.T_odom_cam, in_reference, camera)
-    scale = np.linalg.det(warps)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sound = np.abs(np.log(scale)) < MAX_LOG_SCALE
+        sound = np.abs(np.log(np.linalg.det(warps))) < MAX_LOG_SCALE
     mine, theirs, warps = mine[sound], theirs[sound], warps[sound]
     there, correlation = align_warped(reference.image, image, reference.seen[theirs], tracks.pixels[mine], warps)
     moved = np.linalg.norm(there - tracks.pixels[mine], axis=1)

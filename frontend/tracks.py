@@ -32,18 +32,20 @@ class Tracks:
 
 
 class TrackAges:
-    """Counts for how many posed frames each track has lived."""
+    """Counts for how many posed frames of a session each track has lived."""
 
     def __init__(self) -> None:
-        self._session = -1
-        self._ids = np.zeros(0, np.int64)
+        self._ids = np.zeros(0, np.int64)  # ascending
         self._ages = np.zeros(0, np.int32)
 
-    def step(self, session: int, ids: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the ages (N,) of the tracks (N,) of the next posed frame; those not seen before are 1."""
-        ages = np.ones(len(ids), np.int32)
-        if session == self._session:
-            _, now, before = np.intersect1d(ids, self._ids, assume_unique=True, return_indices=True)
-            ages[now] += self._ages[before]
-        self._session, self._ids, self._ages = session, ids, ages
-        return ages
+    def step(self, ids: NDArray[np.int64]) -> None:
+        """Take the tracks (N,) of the next posed frame; others are forgotten."""
+        ids = np.sort(ids)
+        self._ids, self._ages = ids, self.of(ids) + np.int32(1)
+
+    def of(self, ids: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return in how many posed frames in a row tracks (N,) have been seen, 0 for unknown ones."""
+        if len(self._ids) == 0:
+            return np.zeros(len(ids), np.int32)
+        index = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
+        return np.where(self._ids[index] == ids, self._ages[index], np.int32(0))

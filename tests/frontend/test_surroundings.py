@@ -149,9 +149,9 @@ def test_odometry_tells_the_ages_of_its_tracks_and_the_share_of_near_points() ->
         assert 1 <= one.track_ages.min() <= one.track_ages.max() == i
         assert 0.6 < one.near_share <= 1
     ages = TrackAges()
-    assert ages.step(0, np.array([3, 9, 5])).tolist() == [1, 1, 1]
-    assert ages.step(0, np.array([9, 7, 3])).tolist() == [2, 1, 2]
-    assert ages.step(1, np.array([9, 7])).tolist() == [1, 1]
+    ages.step(np.array([3, 9, 5]))
+    ages.step(np.array([9, 7, 3]))
+    assert ages.of(np.array([9, 7, 3, 5, 4])).tolist() == [2, 1, 2, 0, 0]
 
 
 @pytest.mark.parametrize("detector", ["harris", "harris_laplace"])
