@@ -75,7 +75,7 @@ def test_the_views_most_alike_are_worth_revisiting() -> None:
 
 
 def test_a_camera_that_looks_to_and_fro_does_not_drift() -> None:
-    """Test: six sweeps over one wall. Expected: with an archive the error stays at that of the first sweep."""
+    """Test: six sweeps over one wall. Expected: with keyframes revisited the error stays at that of the first sweep."""
     yaws = np.concatenate([np.linspace(0, 1.1, 14), np.linspace(1.1, 0, 14)] * 3)
     poses = [looking(yaw) for yaw in yaws]
     frames = [WORLD.render(T, k, (k + 1) * 66_000_000) for k, T in enumerate(poses)]
@@ -89,6 +89,6 @@ def test_a_camera_that_looks_to_and_fro_does_not_drift() -> None:
         moved = [np.linalg.norm((origin @ T)[:3, 3] - t[:3, 3]) for T, t in zip(estimates, true, strict=True)]
         return np.array(moved[-14:])
 
-    kept, forgotten = (last_errors(CONFIG.model_copy(update={"archive_keyframes": n})) for n in (60, 0))
+    kept, forgotten = (last_errors(CONFIG.model_copy(update={"revisit_keyframes": n})) for n in (3, 0))
     assert 0 < kept.mean() < 0.03
     assert kept.mean() < 0.8 * forgotten.mean()
