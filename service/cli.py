@@ -12,6 +12,7 @@ from seamark import SeamarkError, __version__
 from seamark.service.graph_commands import graph_app
 from seamark.service.loop_commands import loops_command
 from seamark.service.map_commands import map_app
+from seamark.service.optimise_commands import optimise_command
 from seamark.service.places_commands import places_app
 from seamark.service.terminal import Bar, errors, print_json, print_table
 
@@ -38,6 +39,7 @@ app.add_typer(graph_app, name="graph")
 app.add_typer(places_app, name="places")
 app.add_typer(map_app, name="map")
 map_app.command("loops")(loops_command)
+map_app.command("optimise")(optimise_command)
 
 Sources = Annotated[list[str], typer.Argument(help="Folders, videos or synth:NAME, taken one after another.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]

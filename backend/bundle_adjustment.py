@@ -1,0 +1,268 @@
+"""Full bundle adjustment of a map: all poses and landmarks together (Triggs et al., "Bundle Adjustment", 1999).
+
+Landmarks are tracks of matches between odometry neighbours and over accepted loops. Where depth was measured it counts
+as the disparity of a narrow pair of eyes, whose error is Gaussian at any distance. Odometry joins only what too few
+landmarks hold. Landmarks are eliminated first (Schur), by the ordering. To be run in a process that answers nobody.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+from numpy.typing import NDArray
+
+from seamark.backend.config import BackendConfig
+from seamark.backend.errors import SolverError
+from seamark.backend.tracks import Tracks, find_tracks, neighbours, relative_pose
+from seamark.backend.types import Loop
+from seamark.frontend import se3
+from seamark.frontend.types import Keyframe
+
+Matrix = NDArray[np.float64]
+
+EYES_M = 0.1  # between the eyes that a measured depth is expressed by
+HUBER = 1.345
+OUTLIER = 4.0  # standard deviations beyond which an observation is dropped before the second round
+HELD_BY = 30  # tracks between neighbours below which odometry joins them
+DEPTH_SIGMA = (0.02, 0.003)  # of inverse depth, per median: in the first round, and at least when it is measured
+FIRST_TOLERANCE = 1e-3  # relative change of the error that ends the first round
+PRIOR_SIGMA = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Poses ``T_map_cam`` (N, 4, 4) of ``keyframe_ids`` (N,), and how well they explain what was seen.
+
+    Errors are median and RMS over the same observations before and after, in pixels.
+    """
+
+    keyframe_ids: NDArray[np.int64]
+    T_map_cam: Matrix
+    landmarks: int
+    observations: int
+    dropped: int
+    median_px: tuple[float, float]
+    rms_px: tuple[float, float]
+    iterations: int
+
+    @property
+    def better(self) -> bool:
+        """Return whether the new poses explain the observations better than the old ones."""
+        return bool(np.isfinite(self.T_map_cam).all() and self.rms_px[1] < self.rms_px[0])
+
+
+def adjust(
+    keyframes: Sequence[Keyframe],
+    T_map_cam: Mapping[int, Matrix],
+    scales: Mapping[int, float],
+    loops: Sequence[Loop],
+    config: BackendConfig,
+) -> Adjusted:
+    """Adjust one component: keyframes with features and a pose, and the accepted loops between them.
+
+    Raises SolverError where no landmarks join the keyframes, or no finite solution is found.
+    """
+    known = {k.id: k for k in keyframes if len(k.features) and k.camera is not None and k.id in T_map_cam}
+    T_relative = {pair: relative_pose(T_map_cam, scales, *pair) for pair in neighbours(list(known.values()))}
+    for loop in loops:
+        if loop.accepted and loop.T_match_query is not None and {loop.query_id, loop.match_id} <= known.keys():
+            T_relative[loop.query_id, loop.match_id] = loop.T_match_query
+    tracks = find_tracks(known, T_relative.keys(), T_relative, config.verification)
+    if tracks.count < 10:
+        raise SolverError(f"{tracks.count} landmarks are seen by two keyframes of {len(known)}: too few to adjust")
+    problem = _Problem(known, T_map_cam, scales, tracks, config)
+    start = problem.initial()
+    kept = np.ones(len(tracks.track), bool)
+    values, iterations = problem.solve(start, kept, problem.depth_sigma(None), FIRST_TOLERANCE)
+    kept = problem.within(values, OUTLIER)
+    values, more = problem.solve(values, kept, problem.depth_sigma(values))
+    before, after = problem.errors_px(start)[kept], problem.errors_px(values)[kept]
+    ids = np.array(sorted(known), np.int64)
+    poses = np.stack([values.atPose3(X(number)).matrix() for number in ids.tolist()])
+    if not np.isfinite(poses).all():
+        raise SolverError(f"the adjustment of {len(ids)} keyframes has no finite solution")
+    return Adjusted(
+        ids,
+        poses,
+        tracks.count,
+        int(kept.sum()),
+        int((~kept).sum()),
+        (float(np.median(before)), float(np.median(after))),
+        (float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2)))),
+        iterations + more,
+    )
+
+
+class _Problem:
+    """One adjustment: what was seen, as arrays in the order of the tracks' observations."""
+
+    def __init__(
+        self,
+        keyframes: Mapping[int, Keyframe],
+        T_map_cam: Mapping[int, Matrix],
+        scales: Mapping[int, float],
+        tracks: Tracks,
+        config: BackendConfig,
+    ) -> None:
+        self._keyframes, self._T, self._tracks, self._config = keyframes, T_map_cam, tracks, config
+        pixels = np.empty((len(tracks.track), 2))
+        points = np.full((len(tracks.track), 3), np.nan)  # in the camera's frame, in map units
+        for number, keyframe in keyframes.items():
+            mine = tracks.keyframe == number
+            assert keyframe.camera is not None
+            pixels[mine] = keyframe.camera.undistort(keyframe.features.points[tracks.feature[mine]])
+            points[mine] = keyframe.landmarks[tracks.feature[mine]].astype(np.float64) * scales[number]
+        self._pixels, self._points = pixels, points
+        self._metric = all(keyframe.metric for keyframe in keyframes.values())
+        self._sigma_px = config.verification.noise_px
+        self._cameras = {number: _calibration(keyframe) for number, keyframe in keyframes.items()}
+
+    def initial(self) -> gtsam.Values:
+        """Return the map's poses, and each track's landmark as the middle of what its keyframes say."""
+        values = gtsam.Values()
+        for number in self._keyframes:
+            T = self._T[number]
+            values.insert(X(number), gtsam.Pose3(gtsam.Rot3.ClosestTo(T[:3, :3]), T[:3, 3]))
+        world = np.full((len(self._pixels), 3), np.nan)
+        for number in self._keyframes:
+            mine = self._tracks.keyframe == number
+            world[mine] = se3.transform(self._T[number], self._points[mine])
+        for track, rows in self._rows():
+            values.insert(L(track), np.nanmedian(world[rows], axis=0))
+        return values
+
+    def depth_sigma(self, values: gtsam.Values | None) -> float:
+        """Return the deviation of measured inverse depths (1/map unit): what is usual, or what a solution shows.
+
+        A depth camera that is warped errs alike from frame to frame; only a solution that the pictures have a say in
+        shows it.
+        """
+        z = self._points[:, 2]
+        known = np.isfinite(z)
+        middle = 1 / float(np.median(z[known])) if known.any() else 1.0
+        if values is None or not known.any():
+            return DEPTH_SIGMA[0] * middle
+        points = self._landmarks(values)[self._tracks.track]
+        solved = np.full(len(z), np.nan)
+        for number in self._keyframes:
+            mine = self._tracks.keyframe == number
+            solved[mine] = se3.transform(se3.inverse(values.atPose3(X(number)).matrix()), points[mine])[:, 2]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            difference = np.abs(1 / z - 1 / solved)
+        return max(1.4826 * float(np.nanmedian(difference)), DEPTH_SIGMA[1] * middle)
+
+    def solve(
+        self, start: gtsam.Values, kept: NDArray[np.bool_], depth_sigma: float, tolerance: float = 1e-5
+    ) -> tuple[gtsam.Values, int]:
+        """Return the solution with the kept observations, and the iterations that it took."""
+        graph = gtsam.NonlinearFactorGraph()
+        robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
+        flat = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Isotropic.Sigma(2, self._sigma_px))
+        depth = self._depth_noise(robust, depth_sigma)
+        values, landmarks, poses = gtsam.Values(), set(), sorted(self._keyframes)
+        for row, track, number in zip(
+            np.flatnonzero(kept), self._tracks.track[kept].tolist(), self._tracks.keyframe[kept].tolist(), strict=True
+        ):
+            u, v = self._pixels[row]
+            mono, stereo = self._cameras[number]
+            z = self._points[row, 2]
+            if self._metric and np.isfinite(z):
+                seen = gtsam.StereoPoint2(u, u - mono.fx() * EYES_M / z, v)
+                graph.add(gtsam.GenericStereoFactor3D(seen, depth[number], X(number), L(track), stereo))
+            else:
+                graph.add(gtsam.GenericProjectionFactorCal3_S2((u, v), flat, X(number), L(track), mono))
+            landmarks.add(track)
+        for track in sorted(landmarks):
+            values.insert(L(track), start.atPoint3(L(track)))
+        for number in poses:
+            values.insert(X(number), start.atPose3(X(number)))
+        self._hold(graph, values, kept)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(self._config.graph.batch_iterations)
+        parameters.setRelativeErrorTol(tolerance)
+        keys = [X(number) for number in poses]
+        parameters.setOrdering(gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, keys))
+        try:
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+            solved = optimizer.optimize()
+        except RuntimeError as error:
+            raise SolverError(f"the adjustment of {len(poses)} keyframes has no solution: {error}") from error
+        return solved, int(optimizer.iterations())
+
+    def errors_px(self, values: gtsam.Values) -> NDArray[np.float64]:
+        """Return reprojection errors (M,); infinite for landmarks that the values lack or behind the camera."""
+        out = np.full(len(self._pixels), np.inf)
+        points = self._landmarks(values)
+        for number, keyframe in self._keyframes.items():
+            mine = np.flatnonzero(self._tracks.keyframe == number)
+            T = se3.inverse(values.atPose3(X(number)).matrix())
+            p = se3.transform(T, points[self._tracks.track[mine]])
+            ahead = p[:, 2] > 1e-6
+            assert keyframe.camera is not None
+            uv = keyframe.camera.project_ideal(p[ahead])
+            out[mine[ahead]] = np.linalg.norm(uv - self._pixels[mine[ahead]], axis=1)
+        return out
+
+    def _landmarks(self, values: gtsam.Values) -> Matrix:
+        """Return the landmark (3,) of each track, NaN where the values have none."""
+        points = np.full((int(self._tracks.track.max()) + 1, 3), np.nan)
+        for track in range(len(points)):
+            if values.exists(L(track)):
+                points[track] = values.atPoint3(L(track))
+        return points
+
+    def within(self, values: gtsam.Values, sigmas: float) -> NDArray[np.bool_]:
+        """Return which observations (M,) are no outliers and belong to a landmark with at least two such."""
+        errors = self.errors_px(values)
+        typical = max(self._sigma_px, float(np.median(errors[np.isfinite(errors)])))
+        good: NDArray[np.bool_] = errors < sigmas * typical
+        count = np.bincount(self._tracks.track[good], minlength=int(self._tracks.track.max()) + 1)
+        return np.asarray(good & (count[self._tracks.track] >= 2))
+
+    def _rows(self) -> list[tuple[int, NDArray[np.int64]]]:
+        """Return for each track which observations are its."""
+        starts = np.flatnonzero(np.r_[True, np.diff(self._tracks.track) > 0])
+        ends = np.r_[starts[1:], len(self._tracks.track)]
+        return [(int(self._tracks.track[a]), np.arange(a, b)) for a, b in zip(starts, ends, strict=True)]
+
+    def _depth_noise(self, robust: gtsam.noiseModel.mEstimator.Base, sigma: float) -> dict[int, gtsam.noiseModel.Base]:
+        """Return for each keyframe the noise of (left, right, row): right is left less the disparity."""
+        noise = {}
+        for number, (mono, _) in self._cameras.items():
+            left = self._sigma_px**2
+            disparity = (mono.fx() * EYES_M * sigma) ** 2
+            covariance = np.array([[left, left, 0], [left, left + disparity, 0], [0, 0, left]])
+            gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+            noise[number] = gtsam.noiseModel.Robust.Create(robust, gaussian)
+        return noise
+
+    def _hold(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
+        """Fix the gauge, and join by odometry what too few landmarks hold."""
+        poses = sorted(self._keyframes)
+        sigma = gtsam.noiseModel.Isotropic.Sigma(6, PRIOR_SIGMA)
+        graph.add(gtsam.PriorFactorPose3(X(poses[0]), values.atPose3(X(poses[0])), sigma))
+        if not self._metric:  # and the scale: the farthest keyframe keeps its place
+            places = np.stack([self._T[number][:3, 3] for number in poses])
+            far = poses[int(np.linalg.norm(places - places[0], axis=1).argmax())]
+            held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
+            graph.add(gtsam.PoseTranslationPrior3D(X(far), values.atPose3(X(far)).translation(), held))
+        seen: dict[int, set[int]] = {number: set() for number in poses}
+        for track, number in zip(self._tracks.track[kept].tolist(), self._tracks.keyframe[kept].tolist(), strict=True):
+            seen[number].add(track)
+        last: dict[int, int] = {}
+        weak = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([np.deg2rad(0.5), 0.02], 3))
+        for number in poses:
+            before = last.get(self._keyframes[number].session)
+            last[self._keyframes[number].session] = number
+            if before is not None and len(seen[number] & seen[before]) < HELD_BY:
+                motion = values.atPose3(X(before)).between(values.atPose3(X(number)))
+                graph.add(gtsam.BetweenFactorPose3(X(before), X(number), motion, weak))
+
+
+def _calibration(keyframe: Keyframe) -> tuple[gtsam.Cal3_S2, gtsam.Cal3_S2Stereo]:
+    camera = keyframe.camera
+    assert camera is not None
+    numbers = (camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+    return gtsam.Cal3_S2(*numbers), gtsam.Cal3_S2Stereo(*numbers, EYES_M)
