@@ -1,0 +1,153 @@
+"""Full adjustment of poses and landmarks against a world of points whose poses are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from seamark.backend.bundle_adjustment import adjust
+from seamark.backend.config import BackendConfig
+from seamark.backend.errors import MapError, SolverError
+from seamark.backend.map_optimise import carried, optimise_map
+from seamark.backend.map_store import MapStore
+from seamark.backend.tracks import find_tracks, neighbours
+from seamark.backend.types import Loop, MapSnapshot, Reason
+
+CONFIG = BackendConfig()
+COUNT = 8
+
+
+def scene(world, move, metric=True, depth_noise=0.01, **options):
+    """Keyframes that pass along a wall and back to the first; poses of a map that have drifted; the true ones."""
+    w = world(5, 700)
+    rng = np.random.default_rng(2)
+    truth, poses, keyframes = [], {}, []
+    for k in range(COUNT):
+        s = min(k, COUNT - 1 - k) / 3.5
+        truth.append(move((0, 0.05 * s, 0), (0.8 * s, 0.1 * (k % 2), 0.1 * k)))
+        drift = move(tuple(0.002 * k * rng.normal(size=3)), tuple(0.006 * k * rng.normal(size=3)))
+        poses[k] = truth[-1] @ drift
+        keyframes.append(
+            w.view(
+                truth[-1],
+                depth_noise=depth_noise,
+                id=k,
+                index=k,
+                stamp_ns=k * 10**9,
+                previous_id=k - 1 if k else None,
+                T_odom_cam=poses[k],
+                covariance=1e-4 * np.eye(6),
+                metric=metric,
+                **options,
+            )
+        )
+    T = np.linalg.inv(truth[0]) @ truth[COUNT - 1]
+    loop = Loop(COUNT - 1, 0, True, Reason.ACCEPTED, 200, 0.5, 0.4, 0.1, T, 1e-6 * np.eye(6))
+    return keyframes, poses, np.array(truth), loop
+
+
+def worst(poses, truth):
+    """Largest errors (m, rad) of poses relative to the first."""
+    motion = [np.linalg.inv(poses[0]) @ T for T in poses]
+    true = [np.linalg.inv(truth[0]) @ T for T in truth]
+    errors = [np.linalg.inv(a) @ b for a, b in zip(true, motion, strict=True)]
+    angles = [np.arccos(np.clip((np.trace(E[:3, :3]) - 1) / 2, -1, 1)) for E in errors]
+    return max(np.linalg.norm(E[:3, 3]) for E in errors), max(angles)
+
+
+def test_drift_is_taken_out_to_the_noise(world, move):
+    keyframes, poses, truth, loop = scene(world, move)
+    before = worst([poses[k] for k in range(COUNT)], truth)
+    result = adjust(keyframes, poses, dict.fromkeys(poses, 1.0), [loop], CONFIG)
+    after = worst(result.T_map_cam, truth)
+    assert before[0] > 0.03
+    assert after[0] < 0.25 * before[0]
+    assert after[0] < 0.01
+    assert after[1] < 0.3 * before[1]
+    assert result.better
+    assert result.keyframe_ids.tolist() == list(range(COUNT))
+    assert result.rms_px[1] < result.rms_px[0]
+    assert 0.4 < result.rms_px[1] < 0.8  # the world's noise is 0.5 px per coordinate, less what points take of it
+    assert result.observations > 2 * result.landmarks > 400
+    np.testing.assert_allclose(result.T_map_cam[0], poses[0], atol=1e-3)
+
+
+def test_wrong_matches_and_wrong_depths_do_not_matter(world, move):
+    keyframes, poses, truth, loop = scene(world, move, outliers=0.2)
+    result = adjust(keyframes, poses, dict.fromkeys(poses, 1.0), [loop], CONFIG)
+    assert worst(result.T_map_cam, truth)[0] < 0.012
+    assert result.rms_px[1] < 0.8
+
+
+def test_without_scale_the_shape_is_found(world, move):
+    """Test: landmarks in a unit of 0.5 m, no metric depth. Expected: the poses up to the scale of the map."""
+    keyframes, poses, truth, loop = scene(world, move, metric=False, unit=0.5)
+    poses = {k: np.block([[T[:3, :3], 2 * T[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]]) for k, T in poses.items()}
+    T = loop.T_match_query.copy()
+    T[:3, 3] *= 2
+    result = adjust(keyframes, poses, dict.fromkeys(poses, 1.0), [replace(loop, T_match_query=T)], CONFIG)
+    a, b = result.T_map_cam[:, :3, 3], truth[:, :3, 3]
+    a, b = a - a[0], b - b[0]
+    scale = (a * b).sum() / (a * a).sum()
+    assert 0.45 < scale < 0.55
+    assert np.abs(scale * a - b).max() < 0.03
+
+
+def test_the_same_input_gives_the_same_bits(world, move):
+    keyframes, poses, _, loop = scene(world, move)
+    results = [adjust(keyframes, poses, dict.fromkeys(poses, 1.0), [loop], CONFIG).T_map_cam for _ in range(2)]
+    assert results[0].tobytes() == results[1].tobytes()
+
+
+def test_strangers_are_named(world, move):
+    keyframes, poses, _, _ = scene(world, move)
+    apart = [replace(keyframes[0]), replace(world(9).view(np.eye(4), id=1), session=0)]
+    with pytest.raises(SolverError, match="too few"):
+        adjust(apart, poses, dict.fromkeys(poses, 1.0), [], CONFIG)
+
+
+def test_tracks_see_each_keyframe_once(world, move):
+    keyframes, _poses, truth, _ = scene(world, move)
+    known = {k.id: k for k in keyframes}
+    pairs = neighbours(keyframes)
+    assert pairs[:4] == [(1, 0), (2, 0), (2, 1), (3, 0)]
+    true = {(q, m): np.linalg.inv(truth[m]) @ truth[q] for q, m in pairs}
+    tracks = find_tracks(known, pairs, true, CONFIG.verification)
+    seen = list(zip(tracks.track.tolist(), tracks.keyframe.tolist(), strict=True))
+    assert len(seen) == len(set(seen))
+    assert np.bincount(tracks.track).min() >= 2
+    # A track is one point of the world: its descriptor is the same in all keyframes.
+    for track in range(0, tracks.count, 25):
+        rows = np.flatnonzero(tracks.track == track)
+        words = {known[tracks.keyframe[r]].features.descriptors[tracks.feature[r]].tobytes() for r in rows}
+        assert len(words) == 1
+
+
+def test_a_map_gets_a_new_revision_or_keeps_its_poses(world, move, tmp_path):
+    keyframes, poses, truth, loop = scene(world, move)
+    path = tmp_path / "map.seamark"
+    ids, zeros = np.arange(COUNT), np.zeros(COUNT, int)
+    with MapStore(path) as store, pytest.raises(MapError, match="no poses"):
+        store.close()
+        optimise_map(path, CONFIG)
+    with MapStore(path) as store:
+        for keyframe in keyframes:
+            store.add_keyframe(keyframe)
+        store.add_loop(loop)
+        store.update_poses(MapSnapshot(7, ids, zeros, zeros, np.stack(list(poses.values())), np.ones(COUNT), ()))
+        store.forget([3])
+    done = optimise_map(path, CONFIG)
+    assert done.revision == 8
+    assert worst(done.after, truth)[0] < 0.5 * worst(done.before, truth)[0]
+    with MapStore(path, read_only=True) as store:
+        assert store.meta()["revision"] == "8"
+        stored = store.load_poses()
+    np.testing.assert_allclose(np.stack([stored[k][0] for k in range(COUNT)]), done.after)
+    # Keyframe 3 has no features any more: it moved along with its neighbour.
+    np.testing.assert_allclose(
+        np.linalg.inv(done.after[2]) @ done.after[3], np.linalg.inv(poses[2]) @ poses[3], atol=1e-9
+    )
+    assert carried({0: np.eye(4), 5: np.eye(4)}, {0: 2 * np.eye(4)}).keys() == {0, 5}
+    again = optimise_map(path, CONFIG)
+    assert np.abs(again.after - done.after).max() < 0.01
+    assert again.revision in (None, 9)
