@@ -1,5 +1,6 @@
 """What the pose graph takes and gives, and what its two solvers have in common; free of GTSAM."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from seamark.backend.errors import BackendInputError
 
 Matrix = NDArray[np.float64]
+Key = tuple[int, int]  # query and match, which name a loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,16 @@ class Constraint:
     scale: float = 1.0
     scale_sigma: float = 1e-3
 
+    @property
+    def key(self) -> Key:
+        """The pair of keyframes, which names the loop."""
+        return self.query_id, self.match_id
+
+    @property
+    def name(self) -> str:
+        """The loop in words."""
+        return f"loop {self.query_id} to {self.match_id}"
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -66,8 +78,20 @@ class Solver(Protocol):
     def remove_loop(self, query_id: int, match_id: int) -> None:
         """Withdraw a loop; it ceases to act at the next ``optimise``."""
 
+    def request(self) -> None:
+        """Ask for a solution with all loops so far, to be collected later."""
+
+    def collect(self, wait_s: float = 0.0) -> Estimate | None:
+        """Return the solution that was requested; None when there is none yet, however long one waits at most."""
+
     def optimise(self, thorough: bool = False) -> Estimate:
         """Return the poses with all loops so far; ``thorough`` iterates from scratch to convergence."""
+
+    def weights(self) -> dict[Key, float]:
+        """Return the weight (0..1) that the robust kernel leaves each loop."""
+
+    def covariances(self, keyframe_ids: Sequence[int]) -> Matrix:
+        """Return the marginal covariances (K, 6, 6) of poses, each in its keyframe's frame, rotation first."""
 
     def close(self) -> None:
         """Release what the solver holds."""
@@ -84,7 +108,7 @@ def check_node(node: Node) -> None:
 
 def check_constraint(constraint: Constraint) -> None:
     """Raise BackendInputError unless the loop's numbers are finite, its pose rigid and its scale positive."""
-    name = f"loop {constraint.query_id} to {constraint.match_id}"
+    name = constraint.name
     _check_pose(name, constraint.T_match_query)
     _check_covariance(name, constraint.covariance)
     numbers = (constraint.scale, constraint.scale_sigma)

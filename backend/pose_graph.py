@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from seamark.backend.config import BackendConfig, DriftConfig, GraphConfig
 from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.errors import BackendInputError, SolverError
-from seamark.backend.graph_types import Constraint, Estimate, Node, check_constraint, check_node
+from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_constraint, check_node
 from seamark.backend.graph_variables import PlanarVariables, PoseVariables, SimilarityVariables
 from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
-Key = tuple[int, int]
 _FIRST_ROWS = 1024
 
 
@@ -46,6 +45,7 @@ class PoseGraph:
         self._isam: gtsam.ISAM2 | None = None
         self._solved_rows = 0  # those that iSAM2 knows
         self._new_loops: list[Key] = []
+        self._requested = False
         self._revision = 0
 
     def add_keyframe(self, node: Node) -> None:
@@ -74,10 +74,10 @@ class PoseGraph:
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop, replacing one of the same pair; it acts at the next ``optimise``."""
         check_constraint(constraint)
-        key = (constraint.query_id, constraint.match_id)
+        key = constraint.key
         for keyframe_id in key:
             if keyframe_id not in self._rows:
-                raise BackendInputError(f"loop {key[0]} to {key[1]} names keyframe {keyframe_id}, which is not known")
+                raise BackendInputError(f"{constraint.name} names keyframe {keyframe_id}, which is not known")
         if key in self._loops:
             self._isam = None
         self._loops[key] = constraint
@@ -88,6 +88,17 @@ class PoseGraph:
         if self._loops.pop((query_id, match_id), None) is None:
             raise BackendInputError(f"loop {query_id} to {match_id} was never committed")
         self._isam = None
+
+    def request(self) -> None:
+        """Ask for a solution; here it is made when it is collected."""
+        self._requested = True
+
+    def collect(self, wait_s: float = 0.0) -> Estimate | None:
+        """Return the solution that was requested, None when none was."""
+        if not self._requested:
+            return None
+        self._requested = False
+        return self.optimise()
 
     def optimise(self, thorough: bool = False) -> Estimate:
         """Return the poses with all loops so far; raises SolverError when no finite solution is found."""
