@@ -146,6 +146,9 @@ class GraphConfig(_Section):
     )
     incremental_updates: int = Field(default=5, ge=1, description="most iSAM2 iterations after a loop")
     batch_iterations: int = Field(default=50, ge=1, description="most Levenberg-Marquardt iterations")
+    solve_wait_ms: float = Field(
+        default=200.0, ge=0, description="a keyframe waits so long for its solution; a later one takes it up"
+    )
     unknown_scale_sigma: float = Field(
         default=0.05, gt=0, description="log scale deviation of a mono loop read from disk"
     )

@@ -20,16 +20,24 @@ class MapState:
         self._poses: dict[int, Matrix] = {}
         self._scales: dict[int, float] = {}
         self._components: dict[int, int] = {}  # of each session
+        self._previous: dict[int, int | None] = {}
+        self._first: dict[int, int] = {}
         self._last: dict[int, int] = {}
 
     def add(self, keyframe: Keyframe) -> None:
         """Append a keyframe: a new session in its own frame, else by its motion since the previous keyframe."""
         previous_id = keyframe.previous_id if keyframe.previous_id is not None else self._last.get(keyframe.session)
         self.keyframes[keyframe.id] = keyframe
+        self._previous[keyframe.id] = previous_id
+        self._first.setdefault(keyframe.session, keyframe.id)
         self._last[keyframe.session] = keyframe.id
         self._components.setdefault(keyframe.session, keyframe.session)
-        if keyframe.T_odom_cam is None:
-            return
+        if keyframe.T_odom_cam is not None:
+            self._hang(keyframe, previous_id)
+
+    def _hang(self, keyframe: Keyframe, previous_id: int | None) -> None:
+        """Give a keyframe the pose that odometry says."""
+        assert keyframe.T_odom_cam is not None
         if previous_id is None:
             self._poses[keyframe.id], self._scales[keyframe.id] = keyframe.T_odom_cam, 1.0
             return
@@ -39,13 +47,21 @@ class MapState:
         self._poses[keyframe.id] = self._chain(previous_id, se3.inverse(T_odom_previous) @ keyframe.T_odom_cam)
 
     def take(self, estimate: Estimate) -> None:
-        """Replace all poses by those of the solver, which knows the same keyframes."""
+        """Replace all poses by those of the solver; keyframes that it did not know yet hang on them by odometry."""
         self.revision = estimate.revision
         ids = estimate.keyframe_ids.tolist()
+        since: list[int] = []
+        if len(ids) < len(self._poses):
+            known = set(ids)
+            since = [keyframe_id for keyframe_id in self._poses if keyframe_id not in known]
         self._poses = dict(zip(ids, estimate.T_map_cam, strict=True))
         self._scales = dict(zip(ids, estimate.scales.tolist(), strict=True))
-        for keyframe_id, component in zip(ids, estimate.components.tolist(), strict=True):
-            self._components[self.keyframes[keyframe_id].session] = component
+        for session, first in self._first.items():
+            row = int(np.searchsorted(estimate.keyframe_ids, first))
+            if row < len(ids) and ids[row] == first:
+                self._components[session] = int(estimate.components[row])
+        for keyframe_id in since:
+            self._hang(self.keyframes[keyframe_id], self._previous[keyframe_id])
 
     def pose_of_neighbour(self, keyframe_id: int, T_keyframe_cam: Matrix) -> Matrix | None:
         """Return ``T_map_cam`` of a camera near a keyframe (translation in its units), None without poses."""

@@ -12,7 +12,7 @@ from seamark.backend.config import BackendConfig
 from seamark.backend.consistency import gate_chi2
 from seamark.backend.errors import BackendInputError
 from seamark.backend.evidence import Evidence, Gate
-from seamark.backend.graph_types import Constraint, Node, Solver, check_node
+from seamark.backend.graph_types import Constraint, Estimate, Node, Solver, check_node
 from seamark.backend.judge import PoseJudge
 from seamark.backend.judge_places import PlaceJudge
 from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
@@ -86,7 +86,8 @@ class Slam:
 
         # Commit what is accepted, withdraw what no longer is, and solve.
         started = time.perf_counter()
-        optimised = self._commit([key for key in changed if self._loops[key].accepted != (key in self._committed)])
+        committed = self._commit([key for key in changed if self._loops[key].accepted != (key in self._committed)])
+        optimised = self._collect(self._config.graph.solve_wait_ms / 1e3 if committed else 0.0)
         timings_ms["optimise"] = 1e3 * (time.perf_counter() - started)
         loops = tuple(replace(self._loops[key], evidence=self._evidence.get(key)) for key in changed)
         return StepResult(loops, self._map.revision, optimised, timings_ms)
@@ -96,9 +97,7 @@ class Slam:
         started = time.perf_counter()
         optimised = self._solver is not None and len(self._map.keyframes) > 0
         if self._solver is not None and optimised:
-            estimate = self._solver.optimise(thorough=True)
-            with self._lock:
-                self._map.take(estimate)
+            self._take(self._solver.optimise(thorough=True))
         return StepResult((), self._map.revision, optimised, {"optimise": 1e3 * (time.perf_counter() - started)})
 
     def snapshot(self) -> MapSnapshot:
@@ -117,7 +116,8 @@ class Slam:
             if loop.accepted and (self._solver is None or loop.T_match_query is not None):
                 self._ledger.restore(self._finding_of(loop))
                 accepted.append((loop.query_id, loop.match_id))
-        self._commit(accepted)
+        if self._commit(accepted) and self._solver is not None:
+            self._take(self._solver.optimise())
 
     def locate(self, query: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
         """Say where one image was taken: the verified candidates, localised ones first, then by inliers.
@@ -251,7 +251,7 @@ class Slam:
         return Finding(loop.query_id, loop.match_id, query.session, match.session, loop.inliers, constraint)
 
     def _commit(self, keys: list[Key]) -> bool:
-        """Bring the graph in line with these loops' verdicts; return whether it was solved."""
+        """Bring the graph in line with these loops' verdicts and have it solved; return whether it will be."""
         if not keys:
             return False
         accepted = {key for key in keys if self._loops[key].accepted}
@@ -267,10 +267,22 @@ class Slam:
                 self._solver.add_loop(constraint)
             else:
                 self._solver.remove_loop(*key)
-        estimate = self._solver.optimise()
+        self._solver.request()
+        return True
+
+    def _collect(self, wait_s: float) -> bool:
+        """Take over a solution that is there; one that takes longer than ``wait_s`` is taken at a later keyframe.
+
+        No verdict depends on it: those are made from odometry and loops alone.
+        """
+        estimate = None if self._solver is None else self._solver.collect(wait_s)
+        if estimate is not None:
+            self._take(estimate)
+        return estimate is not None
+
+    def _take(self, estimate: Estimate) -> None:
         with self._lock:
             self._map.take(estimate)
-        return True
 
     def _place(self, candidate: Candidate, match: Keyframe, result: Verification | Rejected, likely: float) -> Place:
         """Say what the comparison of a query image with one keyframe means."""

@@ -30,9 +30,9 @@ class SolverProcess:
 
     What is told is kept here until something is asked, so telling costs nothing, however busy the child is. ``request``
     has the child solve while its parent goes on; what is told meanwhile waits for the next request. The child is
-    started at the first question. When it dies (or gives no answer for ``reply_timeout_s``) it is started again and fed with
-    all it had been told; ``restarts`` counts this. It ends with its parent, even in the midst of solving. Raises
-    SolverError when it cannot be kept alive. To be used by one thread.
+    started at the first question. When it dies (or gives no answer for ``reply_timeout_s``) it is started again and
+    fed with all it had been told; ``restarts`` counts this. It ends with its parent, even in the midst of solving.
+    Raises SolverError when it cannot be kept alive. To be used by one thread.
     """
 
     def __init__(self, config: BackendConfig, reply_timeout_s: float = 300.0) -> None:
