@@ -28,8 +28,9 @@ from seamark.service.zenoh_session import SessionError, Watch, free_endpoint, op
 logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 60.0
-STOP_TIMEOUT_S = 30.0
-KILL_TIMEOUT_S = 5.0
+STOP_TIMEOUT_S = 4.5  # for all nodes together
+# Until when each node may take its time, so that those behind it have theirs; what has not ended then is killed.
+STOP_SHARES = {FRONTEND: 0.45, VOCAB: 0.6, BACKEND: 1.0}
 MAX_RESTARTS = 3
 # More keyframes than a front end can have announced without having handed them over.
 LOST_KEYFRAMES = 4 * KEYFRAME.depth
@@ -132,12 +133,14 @@ class Launcher:
     def stop(self, gently: bool = True) -> tuple[ProcessUsage, ...]:
         """Stop frontend, vocab and backend in this order and return what each has used; may be called again.
 
-        Each gets SIGTERM and time to finish; not ``gently``, or after that time, it is killed.
+        Each gets SIGTERM and time to finish, less if not ``gently``; what has not ended then is killed. That loses
+        nothing acknowledged, and it is over in STOP_TIMEOUT_S.
         """
         with self._lock:
             self._stopping = True
+        began, patience_s = time.monotonic(), STOP_TIMEOUT_S if gently else STOP_TIMEOUT_S / 2
         for name in NODES:
-            self._stop_child(name, STOP_TIMEOUT_S if gently else KILL_TIMEOUT_S)
+            self._stop_child(name, began + patience_s * STOP_SHARES[name])
         if self._bus is not None:
             self._bus.close()
             self._bus = None
@@ -248,7 +251,7 @@ class Launcher:
             session = max(session, status.counters.get("next_session", 0))
         self._settings = replace(self._settings, first_keyframe_id=keyframe_id + margin, first_session=session)
 
-    def _stop_child(self, name: str, timeout_s: float) -> None:
+    def _stop_child(self, name: str, deadline: float) -> None:
         with self._lock:
             child = self._children.get(name)
         if child is None:
@@ -257,7 +260,7 @@ class Launcher:
         with contextlib.suppress(psutil.Error):
             child.peak_rss_bytes = usage_of(child.process.pid)[1]
         self._signal(child, signal.SIGTERM)
-        if not child.ended.wait(timeout_s):
+        if not child.ended.wait(max(0.0, deadline - time.monotonic())):
             logger.warning("%s has not stopped after %.0f s and is killed", name, time.monotonic() - started)
             self._signal(child, signal.SIGKILL)
             child.ended.wait()

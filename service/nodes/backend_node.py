@@ -72,7 +72,15 @@ class BackendNode:
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 
     def stop(self) -> None:
-        """Map what is waiting, settle what is undecided, and write the poses."""
+        """Map what is waiting, as far as that is known, and write the poses as they are."""
+        with self._lock:
+            for keyframe_id in list(self._waiting):
+                self._map(keyframe_id)
+            if not self._settled and self._keeper is not None:
+                self._keeper.save(snapshot=self._slam.snapshot())
+
+    def settle(self) -> None:
+        """Map what is waiting, settle what is undecided, and write the poses; it may take its time."""
         with self._lock:
             for keyframe_id in list(self._waiting):
                 self._map(keyframe_id)
@@ -200,7 +208,7 @@ class BackendNode:
         return ranked
 
     def _on_drain(self, _: object) -> Done:
-        self.stop()
+        self.settle()
         return Done(self._bus.node)
 
 

@@ -1,5 +1,6 @@
 """The front end as a node: frames in; odometry and keyframes out."""
 
+import logging
 import sys
 import threading
 import time
@@ -13,7 +14,7 @@ from seamark.frontend.features import grey_of
 from seamark.frontend.odometry import Frontend
 from seamark.frontend.types import Frame, Keyframe, Odometry, Outcome, Quality
 from seamark.service import topics
-from seamark.service.bus import Bus
+from seamark.service.bus import DRAIN_TIMEOUT_S, Bus, ErrorCode, RemoteError, TimedOutError
 from seamark.service.nodes.keyframe_relay import KeyframeRelay
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.process import run_process
@@ -21,6 +22,9 @@ from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Done, EncodedFrame, Status
 from seamark.service.sources.decode import UnreadableImageError, decode, to_image
 
+logger = logging.getLogger(__name__)
+
+STOP_PATIENCE_S = 1.5
 STALL_S = 2.0  # without an acknowledgement: then the map takes nothing
 
 
@@ -49,23 +53,33 @@ class FrontendNode:
         self._lock = threading.Lock()  # the camera's stream comes in a thread of its own
         self._patient = patient
         self._relay = KeyframeRelay()
-        self._stalled = False
+        self._stalled = self._stopped = False
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
         bus.handle(topics.FRAME, self._on_frame)
         bus.subscribe(topics.CAMERA, self._on_frame)
 
     def stop(self) -> None:
-        """Send the keyframes that are still being made and wait until all are acknowledged."""
+        """Take no more frames, send the keyframes that are being made and wait a little for acknowledgements."""
+        self._stopped = True
+        try:
+            self.settle(STOP_PATIENCE_S)
+        except TimedOutError as error:
+            logger.warning("%s; they are given up", error)
+
+    def settle(self, patience_s: float = DRAIN_TIMEOUT_S) -> None:
+        """Send the keyframes that are still being made and wait until all are acknowledged; raises TimedOutError."""
         with self._lock:
             self._send(self._frontend.finish())
-        self._bus.drain()
+        self._bus.drain(patience_s)
 
     def close(self) -> None:
         """End the threads of the front end."""
         self._frontend.close()
 
     def _on_frame(self, received: Frame | EncodedFrame) -> Odometry:
+        if self._stopped:
+            raise RemoteError(ErrorCode.FAILED, "the front end is stopping")
         started = time.perf_counter()
         with self._lock, self._meter.timed("frame"):
             try:
@@ -91,7 +105,7 @@ class FrontendNode:
         return self._meter.status()
 
     def _on_drain(self, _: object) -> Done:
-        self.stop()
+        self.settle()
         return Done(self._bus.node)
 
     def _send(self, keyframes: tuple[Keyframe, ...]) -> None:

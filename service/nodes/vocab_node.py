@@ -1,5 +1,6 @@
 """The vocabulary as a node: keyframes in, ranked places out."""
 
+import logging
 import sys
 import threading
 from collections.abc import Iterable
@@ -8,7 +9,7 @@ from concurrent.futures import Future
 from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Keyframe
 from seamark.service import topics
-from seamark.service.bus import Bus
+from seamark.service.bus import Bus, TimedOutError
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
@@ -16,6 +17,10 @@ from seamark.service.requests import Done
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import Candidates, PlaceObservation
 from seamark.vocab.vocabulary import Vocabulary
+
+logger = logging.getLogger(__name__)
+
+STOP_PATIENCE_S = 0.5
 
 
 class VocabNode:
@@ -40,8 +45,11 @@ class VocabNode:
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 
     def stop(self) -> None:
-        """Wait until all candidates are acknowledged."""
-        self._bus.drain()
+        """Wait a little until all candidates are acknowledged."""
+        try:
+            self._bus.drain(STOP_PATIENCE_S)
+        except TimedOutError as error:
+            logger.warning("%s; they are given up, and so are their keyframes", error)
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -66,7 +74,7 @@ class VocabNode:
             return self._index.query(observation)
 
     def _on_drain(self, _: object) -> Done:
-        self.stop()
+        self._bus.drain()
         return Done(self._bus.node)
 
 
