@@ -167,6 +167,23 @@ class PlacesConfig(_Section):
     min_support: int = Field(default=1, ge=1, description="neighbouring queries with matching places that confirm one")
 
 
+class MapConfig(_Section):
+    """What a map may take, and what is given up first when it takes more."""
+
+    memory_mb: int = Field(
+        default=256, ge=1, description="features kept in memory; others are read from the map when they are needed"
+    )
+    disk_mb: int = Field(default=20_000, ge=1, description="the map file; beyond it redundant views are forgotten")
+    keyframes: int = Field(
+        default=20_000, ge=2, description="keyframes that can be recognised; beyond it redundant views are forgotten"
+    )
+    place_m: float = Field(default=1.0, gt=0, description="views nearer to each other may stand for one another")
+    place_deg: float = Field(default=20.0, gt=0, description="views whose directions differ by less may do so")
+    alike: float = Field(
+        default=0.25, gt=0, le=1, description="likeness of brightness and colour from which two views show one lighting"
+    )
+
+
 class BackendConfig(_Section):
     """All settings of the back end."""
 
@@ -175,3 +192,4 @@ class BackendConfig(_Section):
     consistency: ConsistencyConfig = ConsistencyConfig()
     graph: GraphConfig = GraphConfig()
     places: PlacesConfig = PlacesConfig()
+    map: MapConfig = MapConfig()

@@ -72,6 +72,9 @@ class Solver(Protocol):
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed."""
 
+    def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+        """Take in a graph that was solved before, with the poses of all nodes, and solve nothing."""
+
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop; it acts at the next ``optimise``."""
 

@@ -10,9 +10,11 @@ from seamark.frontend.types import Keyframe
 
 Matrix = NDArray[np.float64]
 
+StoredPose = tuple[Matrix | None, int, float]
+
 
 class MapState:
-    """Keyframes with their last optimised poses; newer ones hang on these by odometry. Not locked."""
+    """Keyframes without features, with their last optimised poses; newer ones hang on these by odometry. Not locked."""
 
     def __init__(self) -> None:
         self.keyframes: dict[int, Keyframe] = {}
@@ -24,16 +26,23 @@ class MapState:
         self._first: dict[int, int] = {}
         self._last: dict[int, int] = {}
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Append a keyframe: a new session in its own frame, else by its motion since the previous keyframe."""
+    def add(self, keyframe: Keyframe, pose: StoredPose | None = None) -> None:
+        """Append a keyframe: at a pose from before (T_map_cam, component, scale), a new session in its own frame, else
+        by its motion since the previous keyframe.
+        """
         previous_id = keyframe.previous_id if keyframe.previous_id is not None else self._last.get(keyframe.session)
         self.keyframes[keyframe.id] = keyframe
         self._previous[keyframe.id] = previous_id
         self._first.setdefault(keyframe.session, keyframe.id)
         self._last[keyframe.session] = keyframe.id
         self._components.setdefault(keyframe.session, keyframe.session)
-        if keyframe.T_odom_cam is not None:
-            self._hang(keyframe, previous_id)
+        if keyframe.T_odom_cam is None:
+            return
+        if pose is not None and pose[0] is not None:
+            self._poses[keyframe.id], self._scales[keyframe.id] = pose[0], pose[2]
+            self._components[keyframe.session] = pose[1]
+            return
+        self._hang(keyframe, previous_id)
 
     def _hang(self, keyframe: Keyframe, previous_id: int | None) -> None:
         """Give a keyframe the pose that odometry says."""
@@ -62,6 +71,12 @@ class MapState:
                 self._components[session] = int(estimate.components[row])
         for keyframe_id in since:
             self._hang(self.keyframes[keyframe_id], self._previous[keyframe_id])
+
+    def estimate(self) -> Estimate:
+        """Return all poses as a solver would give them."""
+        snapshot = self.snapshot(())
+        columns = (snapshot.keyframe_ids, snapshot.components, snapshot.T_map_cam, snapshot.scales)
+        return Estimate(self.revision, *columns)
 
     def pose_of_neighbour(self, keyframe_id: int, T_keyframe_cam: Matrix) -> Matrix | None:
         """Return ``T_map_cam`` of a camera near a keyframe (translation in its units), None without poses."""

@@ -76,6 +76,15 @@ class MapStore:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def take_over(self) -> None:
+        """Become the writer of a map that was opened read-only; raises MapError, and goes on reading, if that fails."""
+        self.file.close()
+        try:
+            self.file = MapFile(self.path)
+        except MapError:
+            self.file = MapFile(self.path, read_only=True)
+            raise
+
     def set_meta(self, values: Mapping[str, str]) -> None:
         """Write facts about the whole map: mode, vocabulary hash, config hash, version that created it, revision."""
         self.record(meta=values)

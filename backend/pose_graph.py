@@ -71,6 +71,20 @@ class PoseGraph:
             self._poses = np.concatenate([self._poses, self._poses])
         self._poses[row] = node.T_odom_cam if before < 0 else self._poses[before] @ self._motion(row)
 
+    def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+        """Take in a graph that was solved before, with the poses of all nodes: nothing is solved until it has to be."""
+        for node in nodes:
+            self.add_keyframe(node)
+        poses = estimate.T_map_cam.copy()
+        poses[:, :3, :3] *= estimate.scales[:, None, None]
+        rows = [self._rows[number] for number in estimate.keyframe_ids.tolist()]
+        self._poses[rows] = poses
+        for row, component in zip(rows, estimate.components.tolist(), strict=True):
+            self._frames[self._nodes[row].session] = component
+        for constraint in constraints:
+            self.add_loop(constraint)
+        self._revision = estimate.revision
+
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop, replacing one of the same pair; it acts at the next ``optimise``."""
         check_constraint(constraint)

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +17,8 @@ from seamark.backend.judge import PoseJudge
 from seamark.backend.judge_places import PlaceJudge
 from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
 from seamark.backend.likelihood import probability
-from seamark.backend.map_state import MapState
+from seamark.backend.map_memory import KeyframeMemory, Load
+from seamark.backend.map_state import MapState, StoredPose
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.backend.verify import Rejected, Verification, pair_seed, verify
 from seamark.frontend.types import Keyframe, Mode
@@ -42,11 +43,14 @@ class Slam:
     """The back end's memory and its decisions.
 
     ``solver`` is a PoseGraph or SolverProcess; None only in mode places, which knows no poses. ``step`` and ``finish``
-    belong to one thread, ``locate`` and ``snapshot`` may be called from others. Features and landmarks of all
-    keyframes stay in memory, images do not. Same input and ``seed``, same result.
+    belong to one thread, ``locate`` and ``snapshot`` may be called from others. Features and landmarks stay in memory
+    within the budget ``config.map.memory_mb`` if ``load`` reads those of a keyframe again, else all of them; images do
+    not. Same input and ``seed``, same result.
     """
 
-    def __init__(self, config: BackendConfig, mode: Mode, solver: Solver | None, seed: int) -> None:
+    def __init__(
+        self, config: BackendConfig, mode: Mode, solver: Solver | None, seed: int, load: Load | None = None
+    ) -> None:
         if (mode == Mode.PLACES) != (solver is None):
             raise BackendInputError(f"mode {mode} needs {'no' if mode == Mode.PLACES else 'a'} solver")
         self._config, self._solver, self._seed = config, solver, seed
@@ -56,6 +60,7 @@ class Slam:
             judge = PoseJudge(self._chains, config.consistency)
         self._ledger = LoopLedger(judge)
         self._map = MapState()
+        self._memory = KeyframeMemory(config.map.memory_mb << 20, load)
         self._loops: dict[Key, Loop] = {}
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
         self._evidence: dict[Key, Evidence | None] = {}  # of the last step; all of it would be memory without bound
@@ -105,19 +110,42 @@ class Slam:
         with self._lock:
             return self._map.snapshot(tuple(self._loops.values()))
 
-    def restore(self, keyframes: Iterable[Keyframe], loops: Iterable[Loop]) -> None:
-        """Take in what a map on disk holds (keyframes in order of id), accepted loops unasked, and solve."""
-        for keyframe in keyframes:
-            self._add(keyframe)
-        accepted = []
+    def restore(
+        self,
+        keyframes: Iterable[Keyframe],
+        loops: Iterable[Loop],
+        poses: Mapping[int, StoredPose] | None = None,
+        revision: int = 0,
+    ) -> None:
+        """Take in what a map on disk holds (keyframes in order of id, features or not), accepted loops unasked.
+
+        With ``poses``, those of the map at ``revision``, nothing is solved; without, all is.
+        """
+        nodes = [self._hold(keyframe, (poses or {}).get(keyframe.id)) for keyframe in keyframes]
+        accepted: dict[Key, Constraint | None] = {}
         for loop in loops:
             with self._lock:
                 self._loops[loop.query_id, loop.match_id] = loop
             if loop.accepted and (self._solver is None or loop.T_match_query is not None):
-                self._ledger.restore(self._finding_of(loop))
-                accepted.append((loop.query_id, loop.match_id))
-        if self._commit(accepted) and self._solver is not None:
+                finding = self._finding_of(loop)
+                self._ledger.restore(finding)
+                accepted[finding.key] = finding.constraint
+        if poses and self._solver is not None:
+            self._map.revision = revision
+            constraints = [constraint for constraint in accepted.values() if constraint is not None]
+            self._solver.restore([node for node in nodes if node is not None], constraints, self._map.estimate())
+            self._committed |= set(accepted)
+            self._solver.request()  # what was accepted after the last solution; nobody waits for it
+            return
+        for node in nodes:
+            if self._solver is not None and node is not None:
+                self._solver.add_keyframe(node)
+        if self._commit(list(accepted)) and self._solver is not None:
             self._take(self._solver.optimise())
+
+    def forget(self, keyframe_ids: Iterable[int]) -> None:
+        """Drop the features of keyframes: they are not recognised any more, their poses stay."""
+        self._memory.forget(keyframe_ids)
 
     def locate(self, query: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
         """Say where one image was taken: the verified candidates, localised ones first, then by inliers.
@@ -128,7 +156,7 @@ class Slam:
             known = self._map.keyframes.copy()
         places = []
         for candidate in self._islands(candidates, known, None):
-            match = known[candidate.id]
+            match = self._memory.whole(known[candidate.id])
             result = verify(query, match, self._config.verification, pair_seed(self._seed, query.id, match.id))
             likely = probability(query, match, candidate.score)
             places.append(self._place(candidate, match, result, likely))
@@ -136,6 +164,13 @@ class Slam:
 
     def _add(self, keyframe: Keyframe) -> None:
         """Take the keyframe into memory and, but in mode places, into the graph."""
+        node = self._hold(keyframe)
+        if self._solver is not None and node is not None:
+            self._solver.add_keyframe(node)
+
+    def _hold(self, keyframe: Keyframe, pose: StoredPose | None = None) -> Node | None:
+        """Take the keyframe into memory; return what the graph is to know of it."""
+        node = None
         if keyframe.id in self._map.keyframes:
             raise BackendInputError(f"keyframe {keyframe.id} was given twice")
         if self._solver is not None:
@@ -152,15 +187,16 @@ class Slam:
             )
             check_node(node)
             self._chains.add(node)
-            self._solver.add_keyframe(node)
         with self._lock:
-            self._map.add(replace(keyframe, jpeg=b"", thumbnail=np.zeros((0, 0), np.uint8)))
+            self._map.add(self._memory.add(keyframe), pose)
+        return node
 
     def _verify(self, keyframe: Keyframe, candidates: Candidates) -> list[tuple[Candidate, Verification | Rejected]]:
         """Compare the keyframe with the best candidate of each island."""
         verified = []
         for candidate in self._islands(candidates, self._map.keyframes, keyframe):
-            match, seed = self._map.keyframes[candidate.id], pair_seed(self._seed, keyframe.id, candidate.id)
+            match = self._memory.whole(self._map.keyframes[candidate.id])
+            seed = pair_seed(self._seed, keyframe.id, candidate.id)
             verified.append((candidate, verify(keyframe, match, self._config.verification, seed)))
         return verified if self._solver is not None else self._best_of_islands(verified)
 

@@ -63,6 +63,15 @@ class SolverProcess:
         self._keyframes.add(node.id)
         self._told.append(("add_keyframe", (node,)))
 
+    def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+        """Take in a graph that was solved before; the child hears of it when it is first needed."""
+        for node in nodes:
+            check_node(node)
+        self._keyframes |= {node.id for node in nodes}
+        self._loops |= {constraint.key for constraint in constraints}
+        self._told.append(("restore", (nodes, constraints, estimate)))
+        self._revision = estimate.revision
+
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop; it acts at the next solution."""
         check_constraint(constraint)

@@ -136,6 +136,9 @@ def serve_command(
     connect: Annotated[str | None, typer.Option("--connect", help="Use this router instead of an own one.")] = None,
     namespace: NamespaceOption = "default",
     no_loops: NoLoopsOption = False,
+    localise_only: Annotated[
+        bool, typer.Option("--localise-only", help="Answer from the map and never write to it.")
+    ] = False,
     seed: SeedOption = None,
     override: OverrideOption = None,
     config: ConfigOption = None,
@@ -143,7 +146,7 @@ def serve_command(
     """Keep the three nodes alive: frames in, places out, until SIGTERM or Ctrl-C."""
     from seamark.service.serve import ServeOptions, serve
 
-    options = ServeOptions(calib, mode, map_file, vocab, listen, connect, namespace, not no_loops)
+    options = ServeOptions(calib, mode, map_file, vocab, listen, connect, namespace, not no_loops, localise_only)
 
     def ready(endpoint: str, served_mode: str) -> None:
         sys.stdout.write(f"seamark serves mode {served_mode} at {endpoint}, namespace {namespace}, map {map_file}\n")

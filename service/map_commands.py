@@ -63,3 +63,26 @@ def repair_command(
         print_json({"out": str(out), **asdict(report)})
     else:
         print_table(map_report.repair_table(out, report))
+
+
+@map_app.command("export")
+def export_command(
+    map_file: MapArgument,
+    out: Annotated[Path, typer.Option("--out", help="The file to write; for colmap the folder.")],
+    form: Annotated[str, typer.Option("--format", help="tum, kitti, euroc, g2o, colmap or ply.")] = "tum",
+    component: Annotated[
+        int | None,
+        typer.Option("--component", help="Session whose frame of reference is meant; default: the largest."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the keyframes' poses, the pose graph, a COLMAP model or the points of a map."""
+    from seamark.backend.map_export import Format, export_map
+
+    if form not in list(Format):
+        raise typer.BadParameter(f"{form!r} is none of {', '.join(Format)}", param_hint="--format")
+    written = export_map(map_file, out, Format(form), component)
+    if as_json:
+        print_json({"out": str(out), "format": form, **written})
+    else:
+        typer.echo(f"{out}: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in written.items()))

@@ -1,5 +1,6 @@
 """`seamark serve`: keeps the three nodes alive until it is told to stop."""
 
+import contextlib
 import logging
 import signal
 import threading
@@ -7,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from seamark.backend.errors import MapUnwritableError
+from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Mode
 from seamark.service.calibration import load_calibration
 from seamark.service.config import SeamarkConfig
@@ -25,7 +28,7 @@ class ServeOptions:
     """What the service is asked for besides the configuration.
 
     ``calib`` None allows mode places only. ``listen`` is where the own router listens; ``connect``, if given, is the
-    router to use instead.
+    router to use instead. ``localise_only``: see :class:`~seamark.service.nodes.settings.NodeSettings`.
     """
 
     calib: Path | None
@@ -36,6 +39,7 @@ class ServeOptions:
     connect: str | None
     namespace: str
     loops: bool = True
+    localise_only: bool = False
 
 
 def settings_for(options: ServeOptions, config: SeamarkConfig) -> NodeSettings:
@@ -55,6 +59,7 @@ def settings_for(options: ServeOptions, config: SeamarkConfig) -> NodeSettings:
         endpoint=options.connect or "",
         namespace=options.namespace,
         patient=True,
+        localise_only=options.localise_only,
     )
 
 
@@ -65,6 +70,7 @@ def serve(options: ServeOptions, config: SeamarkConfig, ready: Callable[[str, st
     used, and SeamarkError for bad settings.
     """
     settings = settings_for(options, config)
+    _look_at(options.map_path, options.localise_only)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -73,3 +79,10 @@ def serve(options: ServeOptions, config: SeamarkConfig, ready: Callable[[str, st
         while not stop.wait(CHECK_EVERY_S):
             launcher.check()
         logger.info("stopping")
+
+
+def _look_at(path: Path, localise_only: bool) -> None:
+    """Bring a map of an earlier version up to date, and fail at once where the back end would; raises MapError."""
+    with contextlib.suppress(MapUnwritableError):  # the service answers from such a map
+        if localise_only or path.exists():
+            MapStore(path, read_only=localise_only).close()

@@ -2,13 +2,13 @@
 
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
-from pathlib import Path
 
 from seamark import __version__
 from seamark.backend.errors import MapError, MapUnwritableError
 from seamark.backend.graph_types import Solver
-from seamark.backend.map_store import MapStore
+from seamark.backend.map_store import FEATURES, MapStore
 from seamark.backend.slam import Slam, StepResult
 from seamark.backend.solver import SolverProcess
 from seamark.backend.types import MapSnapshot
@@ -34,7 +34,7 @@ class BackendNode:
 
     A keyframe is acknowledged when it is on disk, candidates when their keyframe has been mapped. With ``no_loops``
     candidates are ignored. What ``store`` holds already is taken in first. ``solver`` is closed with the node.
-    ``patient``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`.
+    ``patient`` and ``frozen``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`.
     """
 
     def __init__(
@@ -48,10 +48,11 @@ class BackendNode:
         no_loops: bool = False,
         solver: Solver | None = None,
         patient: bool = False,
+        frozen: bool = False,
     ) -> None:
         self._bus, self._slam, self._no_loops, self._solver = bus, slam, no_loops, solver
         self._meter = Meter(bus.node)
-        self._keeper = None if store is None else MapKeeper(store, self._meter, patient=patient)
+        self._keeper = None if store is None else MapKeeper(store, self._meter, patient=patient, frozen=frozen)
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
         self._known: set[int] = set()
@@ -102,17 +103,17 @@ class BackendNode:
 
     def _restore(self, store: MapStore) -> None:
         """Take in the map from before; keyframes stored and not yet mapped wait for their candidates again."""
-        mapped = int(store.meta().get(MAPPED, -1))
-        before = []
-        for keyframe in store.load_keyframes():
+        meta = store.meta()
+        mapped, before = int(meta.get(MAPPED, -1)), []
+        for keyframe in store.load_nodes():
             self._remember(keyframe)
             if keyframe.id <= mapped:
                 before.append(keyframe)
             else:
-                self._waiting[keyframe.id] = keyframe
+                self._waiting[keyframe.id] = store.keyframe(keyframe.id)
         if before:
-            ids = {keyframe.id for keyframe in before}
-            self._slam.restore(before, [loop for loop in store.load_loops() if loop.query_id in ids])
+            loops = [loop for loop in store.load_loops() if loop.query_id <= mapped and loop.match_id <= mapped]
+            self._slam.restore(before, loops, store.load_poses(), int(meta.get("revision", 0)))
         self._meter.keep("keyframes_restored", len(before))
 
     def _remember(self, keyframe: Keyframe) -> None:
@@ -215,7 +216,7 @@ class BackendNode:
 def build(bus: Bus, settings: NodeSettings) -> BackendNode:
     """Return the node for the settings; raises MapError and its kin when the map cannot be used."""
     config, mode = settings.config, settings.mode
-    store = None if settings.map_path is None else _open(settings.map_path, settings.patient)
+    store = _open(settings)
     solver: Solver | None = None
     try:
         if store is not None:
@@ -224,13 +225,14 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
             solver = _solver(settings)
         return BackendNode(
             bus,
-            Slam(config.backend, mode, solver, config.seed),
+            Slam(config.backend, mode, solver, config.seed, None if store is None else _loader(store)),
             store,
             config.frontend,
             settings.rig.cam0 if settings.rig else None,
             no_loops=settings.no_loops,
             solver=solver,
             patient=settings.patient,
+            frozen=settings.localise_only,
         )
     except BaseException:
         if solver is not None:
@@ -240,14 +242,24 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
         raise
 
 
-def _open(path: Path, patient: bool) -> MapStore:
-    """Return the map for writing; a patient service takes one that cannot be written as it is."""
+def _open(settings: NodeSettings) -> MapStore | None:
+    """Return the map; a patient service takes one that cannot be written as it is."""
+    path = settings.map_path
+    if path is None:
+        return None
+    if settings.localise_only:
+        return MapStore(path, read_only=True)
     try:
         return MapStore(path)
     except MapUnwritableError:
-        if not patient:
+        if not settings.patient:
             raise
         return MapStore(path, read_only=True)
+
+
+def _loader(store: MapStore) -> Callable[[int], Keyframe]:
+    """Return a reader of keyframes' features."""
+    return lambda keyframe_id: store.keyframe(keyframe_id, (FEATURES,))
 
 
 def _solver(settings: NodeSettings) -> Solver:

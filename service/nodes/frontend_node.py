@@ -33,7 +33,7 @@ class FrontendNode:
 
     Frames come as requests, where none is lost, or from the stream of a live camera. Keyframe and session numbers begin
     at ``first_keyframe_id`` and ``first_session``. Frames wait for a slow map, unless it is ``patient`` and takes
-    nothing for STALL_S: then keyframes are left out, and counted, until it takes them again.
+    nothing for STALL_S: then keyframes are left out, and counted, until it takes them again. Not ``learning``, all are.
     """
 
     def __init__(
@@ -44,6 +44,7 @@ class FrontendNode:
         first_keyframe_id: int = 0,
         first_session: int = 0,
         patient: bool = False,
+        learning: bool = True,
     ) -> None:
         self._bus = bus
         self._frontend = frontend
@@ -51,7 +52,7 @@ class FrontendNode:
         self._first_session = first_session
         self._meter = Meter(bus.node)
         self._lock = threading.Lock()  # the camera's stream comes in a thread of its own
-        self._patient = patient
+        self._patient, self._learning = patient, learning
         self._relay = KeyframeRelay()
         self._stalled = self._stopped = False
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
@@ -110,9 +111,9 @@ class FrontendNode:
 
     def _send(self, keyframes: tuple[Keyframe, ...]) -> None:
         for keyframe in map(self._shift_keyframe, keyframes):
-            if self._patient:
+            if self._patient and self._learning:
                 self._stalled = not self._bus.wait_for_room(topics.KEYFRAME, 0.0 if self._stalled else STALL_S)
-            if self._stalled:
+            if self._stalled or not self._learning:
                 self._relay.left_out(keyframe)
                 self._meter.count("keyframes_left_out")
                 continue
@@ -191,6 +192,7 @@ def build(bus: Bus, settings: NodeSettings) -> FrontendNode:
         first_keyframe_id=settings.first_keyframe_id,
         first_session=settings.first_session,
         patient=settings.patient,
+        learning=not settings.localise_only,
     )
 
 

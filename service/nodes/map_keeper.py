@@ -102,7 +102,10 @@ class MapKeeper:
 
     def _write_pending(self) -> None:
         if self.store.file.read_only:
-            self._reopen()
+            try:
+                self.store.take_over()
+            except MapError as error:
+                raise MapUnwritableError(str(error)) from error
         if not self._loops and self._snapshot is None and self._mapped is None:
             return
         meta = {} if self._mapped is None else {MAPPED: str(self._mapped)}
@@ -111,16 +114,6 @@ class MapKeeper:
         finished, self._done = self._done, []
         for done in finished:
             done.set_result(None)
-
-    def _reopen(self) -> None:
-        """Take over a map that could only be read so far."""
-        path = self.store.path
-        self.store.close()
-        try:
-            self.store = MapStore(path)
-        except MapError as error:
-            self.store = MapStore(path, read_only=True)
-            raise MapUnwritableError(str(error)) from error
 
     def _degrade(self, error: MapUnwritableError) -> None:
         self._meter.count("map_unwritable")

@@ -15,6 +15,7 @@ class NodeSettings:
     ``first_keyframe_id`` and ``first_session`` let a front end that was restarted go on counting. ``solver_process``
     puts the pose graph's solver into a process of its own, so that queries stay answered while it works. ``restore``
     tells the vocabulary that there is a map to take places from; the back end, which owns the file, always looks.
+    ``localise_only`` opens the map for reading and leaves it as it is: queries are answered, nothing is learned.
     ``patient`` lets the back end wait for a disk that takes no more, where a run would end.
     """
 
@@ -31,4 +32,5 @@ class NodeSettings:
     solver_process: bool = True
     restore: bool = False
     patient: bool = False
+    localise_only: bool = False
     log_level: str = "WARNING"

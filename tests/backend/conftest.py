@@ -119,22 +119,22 @@ def make_world(
     return World(points, descriptors_of(rng, count), rng)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def world() -> Callable[..., World]:
     return make_world
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def move() -> Callable[..., NDArray[np.float64]]:
     return motion
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def ideal() -> Camera:
     return IDEAL
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def distorted() -> Camera:
     return DISTORTED
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from seamark.backend import map_store
 from seamark.backend.errors import MapError, MapUnwritableError
+from seamark.backend.map_file import MapFile
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
 from seamark.frontend.types import Features, Keyframe
@@ -113,12 +115,12 @@ def test_a_map_that_could_only_be_read_is_taken_over_when_it_can_be_written(
         store.add_keyframe(keyframe(0))
     writable = False
 
-    def opened(path: Path, read_only: bool = False) -> MapStore:
+    def opened(path: Path, read_only: bool = False) -> MapFile:
         if not writable and not read_only:
             raise MapUnwritableError("read-only file system")
-        return MapStore(path, read_only)
+        return MapFile(path, read_only)
 
-    monkeypatch.setattr(map_keeper, "MapStore", opened)
+    monkeypatch.setattr(map_store, "MapFile", opened)
     keeper = MapKeeper(MapStore(path, read_only=True), meter, patient=True)
     assert meter.status().counters["learning"] == 0
     with pytest.raises(RemoteError, match="BUSY"):

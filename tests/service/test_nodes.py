@@ -63,7 +63,7 @@ class FakeSlam:
         self.finished += 1
         return StepResult((), 0, True)
 
-    def restore(self, keyframes: list[Keyframe], loops: list[Loop]) -> None:
+    def restore(self, keyframes: list[Keyframe], loops: list[Loop], poses: object, revision: int) -> None:
         self.restored = [one.id for one in keyframes], [(loop.query_id, loop.match_id) for loop in loops]
 
     def snapshot(self) -> MapSnapshot:
