@@ -21,6 +21,7 @@ Matrix = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 SPREAD_CELLS = (8, 6)
+NEARLY_ALL = 0.8
 CLOSE_DESCRIPTORS = 60.0  # of 512: two that differ by less are of one thing, however alike the other matches are
 
 
@@ -171,16 +172,22 @@ def _well_held(trial: _Trial, refined: RefinedPose) -> bool:
 
 
 def _best_hypothesis(trial: _Trial, seed: int) -> Hypothesis | None:
-    """Estimate the pose with the match's and with the query's landmarks; more inliers win, the match's on a tie."""
+    """Estimate the pose with the match's and with the query's landmarks; more inliers win, the match's on a tie.
+
+    In one unit of length both sides are refined together: there the first is enough when it explains nearly all.
+    """
     query, match, config = trial.query, trial.match, trial.config
     assert query.camera is not None and match.camera is not None
-    X_match = _landmarks(match)[trial.matches.match]
+    X_match, X_query = _landmarks(match)[trial.matches.match], _landmarks(query)[trial.matches.query]
     uv_query = query.camera.undistort(query.features.points[trial.matches.query])
-    poses = [estimate_pose(X_match, uv_query, query.camera, config, seed, in_query_units=False)]
-    X_query = _landmarks(query)[trial.matches.query]
+    first = estimate_pose(X_match, uv_query, query.camera, config, seed, in_query_units=False)
+    if first is not None and query.metric and match.metric:
+        enough = NEARLY_ALL * max(first.pairs, int(np.isfinite(X_query).all(axis=1).sum()))
+        if first.inliers.sum() >= enough:
+            return first
     uv_match = match.camera.undistort(match.features.points[trial.matches.match])
-    poses.append(estimate_pose(X_query, uv_match, match.camera, config, seed, in_query_units=True))
-    found = [pose for pose in poses if pose is not None]
+    second = estimate_pose(X_query, uv_match, match.camera, config, seed, in_query_units=True)
+    found = [pose for pose in (first, second) if pose is not None]
     return max(found, key=lambda pose: int(pose.inliers.sum()), default=None)
 
 

@@ -72,8 +72,7 @@ def look(
     found = np.full(len(known), -1, np.int64)
     if len(known) == 0 or len(viewer) == 0:
         return Sight(known, pixels, found)
-    offset = pixels[:, None] - viewer.points[None].astype(np.float64)
-    squared = (offset**2).sum(axis=2)
+    squared = _squared_distances(pixels, viewer.points)
     hidden = _hidden(squared, p[known, 2], viewer_landmarks[:, 2])
     known, pixels, found, squared = known[~hidden], pixels[~hidden], found[~hidden], squared[~hidden]
     rows, columns = np.nonzero(squared < SEARCH_PX**2)
@@ -86,8 +85,18 @@ def look(
     return Sight(known, pixels, found)
 
 
+def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (N, M) squared distances of pixels; float32 and by coordinate, because this is the costly part."""
+    x = a[:, 0].astype(np.float32)[:, None] - b[:, 0]
+    y = a[:, 1].astype(np.float32)[:, None] - b[:, 1]
+    x *= x
+    y *= y
+    x += y
+    return x
+
+
 def _hidden(
-    squared: NDArray[np.float64], depth: NDArray[np.float64], measured: NDArray[np.float64]
+    squared: NDArray[np.float32], depth: NDArray[np.float64], measured: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Return which landmarks (V,) lie behind what the viewer has measured at the nearest feature with a depth."""
     with_depth = np.flatnonzero(np.isfinite(measured))
