@@ -184,12 +184,12 @@ def _accept_streaks(answers: Sequence[Answer], motion: Motion) -> list[Answer]:
     """Accept the answers that end a streak of neighbouring places which odometry expects, each with enough inliers."""
 
     def expected(row: int, answer: Answer) -> int:
-        if not answer.matches:
+        verdicts = motion.judge(row, np.array([match.place for match in answer.matches], np.int64))
+        if not answer.matches or verdicts[0] != AGREES:
             return -1
-        first, most = answer.matches[0], max(answer.matches, key=lambda match: match.inliers)
-        beside = abs(most.place - first.place) <= STREAK_STEP  # along a way the best place may be a neighbour
-        agrees = (motion.judge(row, np.array([first.place, most.place])) == AGREES).all()
-        return first.place if most.inliers >= STREAK_INLIERS and beside and agrees else -1
+        first = answer.matches[0].place  # along a way the best place may be a neighbour of the one that is verified
+        near = [match for match in answer.matches if abs(match.place - first) <= STREAK_STEP]
+        return first if max(match.inliers for match in near) >= STREAK_INLIERS else -1
 
     lengths = sequence.streaks(np.array([expected(row, answer) for row, answer in enumerate(answers)]), STREAK_STEP)
     return [
