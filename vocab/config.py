@@ -30,6 +30,13 @@ class VocabConfig(BaseModel):
     exclude_recent_count: int = Field(
         default=8, ge=0, description="The last so many places of a session are not candidates."
     )
+    exclude_covisible: float = Field(
+        default=0.5,
+        gt=0.0,
+        le=1.0,
+        description="The last places of a session are not candidates as long as their votes are at least so high: the "
+        "camera has not moved on. 1 leaves it out.",
+    )
     exclude_recent_count_places: int = Field(
         default=20,
         ge=0,
@@ -40,6 +47,10 @@ class VocabConfig(BaseModel):
     view_weight: float = Field(default=0.4, ge=0.0, description="Weight of the view, the edges of the whole image.")
     trusted_features: int = Field(
         default=200, ge=1, description="With fewer features than this an image's votes count proportionally less."
+    )
+    signatures: bool = Field(
+        default=False,
+        description="Keep 64 bits of each feature, so that only features alike within a word vote; 9 bytes more each.",
     )
     histogram_bins: int = Field(default=32, ge=4, le=256, description="Bins of each of the six histograms.")
     histogram_sigma_bins: float = Field(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.vocab import histogram, index_file, view
+from seamark.vocab import histogram, index_file, signatures, view
 from seamark.vocab.config import VocabConfig
 from seamark.vocab.errors import DuplicatePlaceError, IndexFileError, UnknownPlaceError
 from seamark.vocab.histogram import Histograms
@@ -19,6 +19,7 @@ from seamark.vocab.vocabulary import Vocabulary, check_descriptors
 
 NANOSECONDS = 1_000_000_000
 NO_PLACE = -1
+NEAR_VOTES = signatures.vote_table()
 COMPACT_FROM = 64  # removed places; fewer are kept, however few others there are
 
 
@@ -27,13 +28,16 @@ class PlaceIndex:
 
     The score is the weighted mean of the votes, of 1 - J / (2 ln 2), J the Jeffrey divergence, and of the likeness of
     the view; see VocabConfig for the weights. It depends on two images alone, so that rankings of shards merge. The
-    recent past of the image's own session is never a candidate, nor is the image itself.
+    recent past of the image's own session is never a candidate, by time, by number and for as long as the view has
+    hardly changed, nor is the image itself. With ``config.signatures`` only features vote that are alike within their
+    word (Hamming embedding).
     """
 
     def __init__(self, vocabulary: Vocabulary, config: VocabConfig | None = None) -> None:
         self.vocabulary = vocabulary
         self.config = config or VocabConfig()
-        self._inverted = InvertedIndex(vocabulary.idf)
+        self._inverted = InvertedIndex(vocabulary.idf, with_signatures=self.config.signatures)
+        self._directions = signatures.directions(vocabulary) if self.config.signatures else None
         self._slot_of: dict[int, int] = {}
         self._added_to: dict[int, int] = {}  # session -> places ever added to it
         self._table = np.zeros(0, _place_type(self.config.histogram_bins))
@@ -131,6 +135,9 @@ class PlaceIndex:
             raise IndexFileError(f"{path}: made with the vocabulary {made}, not with {given}")
         index = cls(vocabulary, config)
         index._inverted = opened.inverted_index(vocabulary.idf)
+        if index._inverted.with_signatures != index.config.signatures:
+            made = "with" if index._inverted.with_signatures else "without"
+            raise IndexFileError(f"{path}: made with other settings: {made} signatures")
         for name, (kind, _) in (index._table.dtype.fields or {}).items():
             shape = opened.array(f"table.{name}", verify=False).shape
             if shape != (index._inverted.n_slots, *kind.shape):
@@ -165,12 +172,15 @@ class PlaceIndex:
         check_descriptors(observation.descriptors)
         bins, sigma_bins = self.config.histogram_bins, self.config.histogram_sigma_bins
         histograms = histogram.describe(observation.thumbnail, bins, sigma_bins)
-        words = self.vocabulary.assign(observation.descriptors[: self.config.max_descriptors])
-        return _Looks(words, histograms, view.describe(observation.thumbnail))
+        descriptors = observation.descriptors[: self.config.max_descriptors]
+        words, signed = self.vocabulary.assign(descriptors), None
+        if self._directions is not None:
+            signed = signatures.sign(descriptors, self.vocabulary.words, words, self._directions)
+        return _Looks(words, signed, histograms, view.describe(observation.thumbnail))
 
     def _insert(self, observation: PlaceObservation, looks: "_Looks") -> None:
         with self._changing:
-            slot = self._inverted.add(looks.words)
+            slot = self._inverted.add(looks.words, looks.signatures)
             if slot >= len(self._table):
                 more = max(64, len(self._table) // 2)
                 self._table = np.concatenate([self._table, np.zeros(more, self._table.dtype)])
@@ -190,12 +200,12 @@ class PlaceIndex:
             self._slot_of[observation.id] = slot
 
     def _rank(self, observation: PlaceObservation, looks: "_Looks", limit: int) -> Candidates:
-        votes = self._inverted.votes(looks.words).astype(np.float64)
+        votes = self._votes(looks).astype(np.float64)
         places = self._table[: len(votes)]
         jeffrey = histogram.divergence_to_all(looks.histograms, places["values"], places["present"]).astype(np.float64)
         likeness = view.likeness_to_all(looks.view, places["cells"], places["totals"]).astype(np.float64)
         score = self._fuse(votes * min(1.0, len(looks.words) / self.config.trusted_features), jeffrey, likeness)
-        slots = np.flatnonzero(self._eligible(observation, places))
+        slots = np.flatnonzero(self._eligible(observation, places, votes))
         if len(slots) > limit > 0:  # spare the sort of all: nothing below the limit-th score can be ranked
             threshold = np.partition(score[slots], len(slots) - limit)[len(slots) - limit]
             slots = slots[score[slots] >= threshold]
@@ -206,6 +216,11 @@ class PlaceIndex:
         )
         return Candidates(observation.id, observation.stamp_ns, ranked)
 
+    def _votes(self, looks: "_Looks") -> NDArray[np.float32]:
+        if looks.signatures is None:
+            return self._inverted.votes(looks.words)
+        return self._inverted.near_votes(looks.words, looks.signatures, NEAR_VOTES)
+
     def _fuse(
         self, votes: NDArray[np.float64], jeffrey: NDArray[np.float64], likeness: NDArray[np.float64]
     ) -> NDArray[np.float64]:
@@ -215,14 +230,23 @@ class PlaceIndex:
         fused: NDArray[np.float64] = total / (config.votes_weight + config.histogram_weight + config.view_weight)
         return np.clip(fused, 0.0, 1.0)
 
-    def _eligible(self, observation: PlaceObservation, places: NDArray[Any]) -> NDArray[np.bool_]:
-        same_session = places["session"] == observation.session
+    def _eligible(
+        self, observation: PlaceObservation, places: NDArray[Any], votes: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        same_session = places["live"] & (places["session"] == observation.session)
         age_ns = np.abs(places["stamp_ns"] - observation.stamp_ns)
         near = age_ns < round(self.config.exclude_recent_s * NANOSECONDS)
         last = self._added_to.get(observation.session, 0) - self.config.exclude_recent_count
         recent = same_session & (near | (places["ordinal"] >= last))
+        recent[self._covisible(np.flatnonzero(same_session), places, votes)] = True
         eligible: NDArray[np.bool_] = places["live"] & ~recent & (places["id"] != observation.id)
         return eligible
+
+    def _covisible(self, slots: NDArray[np.intp], places: NDArray[Any], votes: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return those of a session's ``slots``, its last ones, since which the view has hardly changed."""
+        newest_first = slots[np.argsort(-places["ordinal"][slots])]
+        changed = np.flatnonzero(votes[newest_first] < self.config.exclude_covisible)
+        return newest_first[: changed[0]] if len(changed) else newest_first
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +254,7 @@ class _Looks:
     """What the index compares of an image."""
 
     words: NDArray[np.int32]
+    signatures: NDArray[np.uint64] | None
     histograms: Histograms
     view: View
 

@@ -6,13 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.vocab.errors import ObservationError
-from seamark.vocab.vocabulary import DESCRIPTOR_SIZE, check_descriptors
+from seamark.vocab.vocabulary import DESCRIPTOR_SIZE, Vocabulary, check_descriptors
 
 SIGNATURE_BITS: Final = 64
 NEAR_BITS: Final = 28
 """Pairs of descriptors of one word that differ in more bits are taken as different things."""
 
 SIGMA_BITS: Final = 20.0
+PROJECTION: Final = "signature_projection"
+"""Name of the directions among the extras of a vocabulary."""
+
+DIRECTIONS_SEED: Final = 64
 ORIENTATION_UNITS: Final = 256
 SCALE_UNITS_PER_BIN: Final = 16
 SCALE_BIN: Final = float(np.log(1.5))
@@ -41,6 +45,23 @@ def learn_projection(
     leading = np.abs(strongest).argmax(axis=1)
     signs = np.sign(strongest[np.arange(SIGNATURE_BITS), leading])
     return np.ascontiguousarray(strongest * signs[:, None], np.float32)
+
+
+def directions(vocabulary: Vocabulary) -> NDArray[np.float32]:
+    """Return the 64 directions of a vocabulary, (64, 128) float32: those it brings as PROJECTION, else general ones.
+
+    The general ones are rows of a Hadamard matrix whose columns have random signs: orthogonal, and of whole numbers, so
+    that signatures have the same bits on every machine.
+    """
+    if PROJECTION in vocabulary.extras:
+        return np.asarray(vocabulary.extras[PROJECTION], np.float32)
+    hadamard = np.ones((1, 1), np.float32)
+    while len(hadamard) < DESCRIPTOR_SIZE:
+        hadamard = np.block([[hadamard, hadamard], [hadamard, -hadamard]])
+    random = np.random.default_rng(DIRECTIONS_SEED)
+    rows = np.sort(random.permutation(DESCRIPTOR_SIZE)[:SIGNATURE_BITS])
+    signs = random.choice(np.array([-1, 1], np.float32), DESCRIPTOR_SIZE)
+    return np.ascontiguousarray(hadamard[rows] * signs, np.float32)
 
 
 def sign(

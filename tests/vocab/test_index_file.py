@@ -70,6 +70,22 @@ def test_what_is_saved_answers_the_same_and_goes_on_the_same(tmp_path: Path) -> 
     assert loaded.query(observe(1008, 1), 40) == index.query(observe(1008, 1), 40)
 
 
+def test_an_index_with_signatures_is_kept_with_them(path: Path, tmp_path: Path) -> None:
+    config = VocabConfig(signatures=True)
+    index = PlaceIndex(VOCABULARY, config)
+    for number in range(40):
+        index.add(observe(number, n=number % 35))
+    index.save(tmp_path / "signed.places")
+    loaded = PlaceIndex.load(tmp_path / "signed.places", VOCABULARY, config)
+    for number in (1000, 1017, 1033):
+        assert loaded.query(observe(number), 40) == index.query(observe(number), 40)
+    loaded.add(observe(1041))
+    with pytest.raises(IndexFileError, match="with signatures"):
+        PlaceIndex.load(tmp_path / "signed.places", VOCABULARY)
+    with pytest.raises(IndexFileError, match="without signatures"):
+        PlaceIndex.load(path, VOCABULARY, config)
+
+
 def test_saving_a_loaded_index_writes_the_same_bytes(path: Path, tmp_path: Path) -> None:
     PlaceIndex.load(path, VOCABULARY).save(tmp_path / "again.places")
     assert (tmp_path / "again.places").read_bytes() == path.read_bytes()

@@ -104,6 +104,47 @@ def test_the_recent_past_is_excluded_by_time(vocabulary: Vocabulary) -> None:
     assert sorted(ids(index.query(world.look(0, 99, stamp_s=10.0)))) == [0, 1, 2, 3, 4, 5, 15, 16, 17, 18, 19]
 
 
+def test_a_camera_that_has_not_moved_on_has_no_past_there(vocabulary: Vocabulary) -> None:
+    """Standing still is no revisit, however long it lasts; once the view has changed, all before is past."""
+    world = World(vocabulary)
+    settings = VocabConfig(exclude_recent_s=0, exclude_recent_count=0, candidates=100, exclude_covisible=0.12)
+    index = PlaceIndex(vocabulary, settings)
+    looks = [3, 3, 8, *[3] * 10]
+    for key, place in enumerate(looks):
+        index.add(world.look(place, key, stamp_s=1000.0 * key))
+    assert sorted(ids(index.query(world.look(3, 50, stamp_s=50_000.0)))) == [0, 1, 2]
+    assert sorted(ids(index.query(world.look(9, 50, stamp_s=50_000.0)))) == list(range(13))
+    assert len(index.query(world.look(3, -1, session=-1)).ranked) == 13
+    for key in (5, 6):
+        index.remove(key)
+    assert sorted(ids(index.query(world.look(3, 50, stamp_s=50_000.0)))) == [0, 1, 2]
+    with pytest.raises(ValidationError):
+        VocabConfig(exclude_covisible=0.0)
+
+
+def test_signatures_tell_apart_what_one_word_lumps_together(vocabulary: Vocabulary) -> None:
+    """Two places show the same words, but lie elsewhere within them: only signatures can rank the right one first."""
+    rng = np.random.default_rng(8)
+    words = rng.integers(0, N_WORDS, 80)
+    aside = rng.choice(np.array([-25, 25]), (2, 80, 128))
+    picture = np.full((12, 16, 3), 90, np.uint8)
+
+    def look(place: int, key: int) -> PlaceObservation:
+        exact = vocabulary.words[words].astype(int) + aside[place] + rng.integers(-4, 5, (80, 128))
+        descriptors = np.clip(exact, 0, 255).astype(np.uint8)
+        return PlaceObservation(key, key, 0, descriptors, np.zeros((80, 2), np.float32), picture)
+
+    plain, signed = (PlaceIndex(vocabulary, VocabConfig(signatures=on)) for on in (False, True))
+    for index in (plain, signed):
+        for place in range(2):
+            index.add(look(place, place))
+    for place in range(2):
+        same, other = (c.votes for c in sorted(plain.query(look(place, -1)).ranked, key=lambda c: c.id != place))
+        assert same == pytest.approx(other, abs=0.02) and same > 0.9
+        near = signed.query(look(place, -1)).ranked
+        assert near[0].id == place and 0.6 < near[0].votes <= 1 and near[1].votes < 0.15
+
+
 def test_time_and_count_add_up(vocabulary: Vocabulary) -> None:
     world = World(vocabulary)
     index = PlaceIndex(vocabulary, VocabConfig(exclude_recent_s=5, exclude_recent_count=8, candidates=100))

@@ -5,6 +5,7 @@ import pytest
 
 from seamark.vocab import signatures
 from seamark.vocab.errors import ObservationError
+from seamark.vocab.vocabulary import Vocabulary
 
 RNG = np.random.default_rng(3)
 WORDS = RNG.integers(40, 200, (50, 128), dtype=np.uint8)
@@ -63,3 +64,13 @@ def test_refuses_too_little_and_the_wrong_shape() -> None:
     with pytest.raises(ObservationError, match="projection"):
         signatures.sign(DESCRIPTORS[:5], WORDS, ASSIGNED[:5], PROJECTION[:32])
     assert len(signatures.sign(DESCRIPTORS[:0], WORDS, ASSIGNED[:0], PROJECTION)) == 0
+
+
+def test_general_directions_are_orthogonal_and_those_of_a_vocabulary_come_first() -> None:
+    words, idf = np.zeros((3, 128), np.uint8), np.ones(3, np.float32)
+    general = signatures.directions(Vocabulary(words, idf))
+    assert general.shape == (64, 128) and set(np.unique(general)) == {-1.0, 1.0}
+    np.testing.assert_array_equal(general @ general.T, 128 * np.eye(64))
+    own = np.random.default_rng(0).normal(size=(64, 128)).astype(np.float32)
+    brought = signatures.directions(Vocabulary(words, idf, extras={signatures.PROJECTION: own}))
+    np.testing.assert_array_equal(brought, own)

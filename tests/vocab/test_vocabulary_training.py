@@ -178,3 +178,19 @@ def test_too_few_descriptors_and_wrong_ones_are_refused() -> None:
         train([], 3, seed=1)
     with pytest.raises(ObservationError):
         train([np.zeros((30, 128), np.float32)], 3, seed=1)
+
+
+def test_clusters_are_as_tight_as_those_of_faiss() -> None:
+    """Another implementation of k-means, with centres in floating point and another start."""
+    faiss = pytest.importorskip("faiss")
+    rng = np.random.default_rng(12)
+    middles = rng.integers(30, 200, (40, 128))
+    descriptors = np.clip(middles[rng.integers(0, 40, 4000)] + rng.normal(0, 25, (4000, 128)), 0, 255).astype(np.uint8)
+    other = faiss.Kmeans(128, 100, niter=8, seed=1, min_points_per_centroid=1, max_points_per_centroid=4000)
+    other.train(descriptors.astype(np.float32))
+
+    def error(centres: np.ndarray) -> float:
+        squared = ((descriptors[:, None].astype(np.float32) - centres[None]) ** 2).sum(axis=2)
+        return float(squared.min(axis=1).mean())
+
+    assert error(k_means(descriptors, 100, 1, 8)) == pytest.approx(error(other.centroids), rel=0.1)
