@@ -50,7 +50,7 @@ class VocabConfig(BaseModel):
     )
     signatures: bool = Field(
         default=False,
-        description="Keep 64 bits of each feature, so that only features alike within a word vote; 9 bytes more each.",
+        description="Keep 64 bits of each feature, so that only features alike within a word vote; 8 bytes more each.",
     )
     histogram_bins: int = Field(default=32, ge=4, le=256, description="Bins of each of the six histograms.")
     histogram_sigma_bins: float = Field(
