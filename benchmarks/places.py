@@ -78,7 +78,9 @@ def by_signatures(database: Images, queries: Images, vocabulary: Vocabulary, *, 
 def describe_features(image: NDArray[np.uint8], config: FrontendConfig) -> NDArray[np.uint8]:
     from seamark.frontend.features import extract_features
 
-    return extract_features(image, config.sift_features, config.sift_contrast).descriptors
+    return extract_features(
+        image, config.sift_features, config.sift_contrast, max_pixels=config.sift_pixels
+    ).descriptors
 
 
 def report(name: str, ranked: Sequence[Sequence[int]], best: Scores, truth: NDArray[np.bool_], ms: float) -> None:

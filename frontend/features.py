@@ -23,17 +23,31 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def extract_features(
-    image: NDArray[np.uint8], n_features: int, contrast: float = 0.015, mask: NDArray[np.uint8] | None = None
+    image: NDArray[np.uint8],
+    n_features: int,
+    contrast: float = 0.015,
+    mask: NDArray[np.uint8] | None = None,
+    max_pixels: int | None = None,
 ) -> Features:
     """Find at most ``n_features`` SIFT key points (Lowe 2004) in a grey or BGR uint8 image, strongest first.
 
-    None is taken where ``mask`` (H, W) uint8 is zero.
+    None is taken where ``mask`` (H, W) uint8 is zero. An image of more than ``max_pixels`` is reduced to so many first;
+    points and scales are those of the whole image all the same.
     """
+    grey, scale = grey_of(image), 1.0
+    if max_pixels is not None and grey.size > max_pixels:
+        scale = float(np.sqrt(max_pixels / grey.size))
+        size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        mask = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
     sift = cv2.SIFT_create(nfeatures=n_features, contrastThreshold=contrast, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey_of(image), mask)
+    keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None or len(keypoints) == 0:
         return Features.empty()
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float32)
+    whole = np.array(image.shape[1::-1]) / np.array(grey.shape[1::-1])
+    table[:, :2] = (table[:, :2] + 0.5) * whole - 0.5
+    table[:, 2] /= scale
     order = np.lexsort((table[:, 1], table[:, 0], -table[:, 4]))[:n_features]
     table, descriptors = table[order], descriptors[order]
     return Features(

@@ -118,7 +118,7 @@ class KeyframeBuilder:
 
     def _make(self, request: KeyframeRequest) -> Keyframe:
         frame, c = request.frame, self._config
-        features = extract_features(frame.image, c.sift_features, c.sift_contrast, frame.mask)
+        features = extract_features(frame.image, c.sift_features, c.sift_contrast, frame.mask, c.sift_pixels)
         ok, jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, c.jpeg_quality])
         assert ok, "an 8-bit image can be encoded"
         return Keyframe(

@@ -37,7 +37,7 @@ def recover(
     """Match a frame against keyframes in the order given; the first that explains it wins, None if none does."""
     if not recent:
         return None
-    features = extract_features(frame.image, config.sift_features, config.sift_contrast, frame.mask)
+    features = extract_features(frame.image, config.sift_features, config.sift_contrast, frame.mask, config.sift_pixels)
     for keyframe in recent:
         matches = match_descriptors(features.descriptors, keyframe.features.descriptors)
         landmarks, spread = _landmarks(keyframe, matches[:, 1], camera)

@@ -56,7 +56,7 @@ def describe_image(image: NDArray[np.uint8], name: str, config: FrontendConfig) 
         way = cv2.INTER_CUBIC if factor > 1.0 else cv2.INTER_AREA
         size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
         sized = np.asarray(cv2.resize(image, size, interpolation=way), np.uint8)
-    found = extract_features(sized, config.sift_features, config.sift_contrast)
+    found = extract_features(sized, config.sift_features, config.sift_contrast, max_pixels=config.sift_pixels)
     part = slice(COMPARED_FEATURES)
     features = LocalFeatures(
         found.points[part],

@@ -28,7 +28,9 @@ def train_vocabulary(
     def batches() -> Iterator[NDArray[np.uint8]]:
         for frame in source.frames():
             if isinstance(frame, Frame):
-                yield extract_features(frame.image, config.sift_features, config.sift_contrast).descriptors
+                yield extract_features(
+                    frame.image, config.sift_features, config.sift_contrast, max_pixels=config.sift_pixels
+                ).descriptors
 
     vocabulary = train(batches(), n_words, seed, provenance={"source": source.name}, progress=progress)
     vocabulary.save(out)

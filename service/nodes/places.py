@@ -79,7 +79,8 @@ class PlaceService:
         own = self._camera
         if camera is None and own is not None and (own.height, own.width) == image.shape[:2]:
             camera = own
-        features = extract_features(image, self._config.sift_features, self._config.sift_contrast)
+        c = self._config
+        features = extract_features(image, c.sift_features, c.sift_contrast, max_pixels=c.sift_pixels)
         return Keyframe(
             id=QUERY_ID,
             session=QUERY_ID,
@@ -88,7 +89,7 @@ class PlaceService:
             file="",
             features=features,
             landmarks=np.full((len(features), 3), np.nan, np.float32),
-            thumbnail=thumbnail_of(image, self._config.thumbnail_px),
+            thumbnail=thumbnail_of(image, c.thumbnail_px),
             jpeg=query.image,
             camera=camera,
         )

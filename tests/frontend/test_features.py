@@ -86,3 +86,22 @@ def test_grey_is_the_image_itself_where_it_is_grey() -> None:
     image = textured(20, 30)
     assert grey_of(image) is image
     assert grey_of(np.zeros((4, 5, 3), np.uint8)).shape == (4, 5)
+
+
+def test_features_of_a_reduced_image_lie_where_those_of_the_whole_one_do() -> None:
+    """Test: SIFT on a third of the pixels, of an odd size, under a mask. Expected: no bias of points and scales."""
+    image = cv2.resize(textured(), (801, 603), interpolation=cv2.INTER_CUBIC)
+    mask = np.full(image.shape, 255, np.uint8)
+    mask[:, 500:] = 0
+    whole = extract_features(image, 1500, mask=mask)
+    reduced = extract_features(image, 500, mask=mask, max_pixels=160_000)
+    assert len(reduced) > 150
+    pairs = match_descriptors(reduced.descriptors, whole.descriptors)
+    offset = reduced.points[pairs[:, 0]] - whole.points[pairs[:, 1]]
+    near = np.linalg.norm(offset, axis=1) < 3
+    assert near.sum() > 60 and near.mean() > 0.8
+    assert np.abs(np.median(offset[near], axis=0)).max() < 0.1
+    assert np.median(reduced.scales[pairs[near, 0]] / whole.scales[pairs[near, 1]]) == pytest.approx(1, abs=0.1)
+    assert reduced.points[:, 0].max() < 503
+    same = extract_features(image, 500, mask=mask, max_pixels=image.size)
+    np.testing.assert_array_equal(same.points, extract_features(image, 500, mask=mask).points)
