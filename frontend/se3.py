@@ -106,7 +106,9 @@ def adjoint(T: Matrix) -> Matrix:
 
 
 def orthonormalise(T: Matrix) -> Matrix:
-    """Return T with its rotation replaced by the nearest proper one (long products drift away from SO(3))."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return make(R, T[:3, 3])
+    """Return T (..., 4, 4) with its rotation replaced by the nearest proper one (long products drift from SO(3))."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    out = np.array(T, np.float64)
+    out[..., :3, :3] = U @ Vt
+    return out

@@ -95,7 +95,7 @@ def adjust(problem: BundleProblem, camera: Camera, *, pixel_sigma: float, iterat
         INITIAL_DAMPING,
         RELATIVE_DECREASE,
     )
-    poses = np.stack([se3.orthonormalise(T) for T in poses])
+    poses = se3.orthonormalise(poses)
     return BundleResult(poses, landmarks, errors * pixel_sigma, covariances, depth_offset, depth_information)
 
 

@@ -41,3 +41,18 @@ def test_half_turns_have_a_quaternion(axis: np.ndarray) -> None:
 def test_level_camera_looks_along_x() -> None:
     np.testing.assert_array_equal(se3.T_WORLD_LEVEL_CAM[:3, :3] @ [0, 0, 1], [1, 0, 0])
     np.testing.assert_array_equal(se3.T_WORLD_LEVEL_CAM[:3, :3] @ [0, -1, 0], [0, 0, 1])
+
+
+def test_many_poses_are_made_orthonormal_like_one() -> None:
+    T = np.stack(
+        [se3.make(se3.exp_rotation(np.array([0.3, -1.2, 2.0]) * k), np.array([k, 2.0, 3.0])) for k in range(4)]
+    )
+    bent = T.copy()
+    bent[:, :3, :3] += np.random.default_rng(0).normal(size=(4, 3, 3)) * 1e-4
+    straight = se3.orthonormalise(bent)
+    np.testing.assert_allclose(straight, T, atol=5e-4)
+    np.testing.assert_allclose(
+        straight[:, :3, :3] @ np.swapaxes(straight[:, :3, :3], 1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_array_equal(straight, np.stack([se3.orthonormalise(one) for one in bent]))
+    np.testing.assert_array_equal(straight[:, :3, 3], T[:, :3, 3])
