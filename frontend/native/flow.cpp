@@ -83,10 +83,11 @@ public:
 private:
     // Returns where the patch around a point is read and the pixel (x, y) it begins in.
     Spot spot_of(const Level& level, Point p, int& x, int& y) const {
-        const float floor_x = std::floor(p.x), floor_y = std::floor(p.y);
-        x = static_cast<int>(floor_x) - half_, y = static_cast<int>(floor_y) - half_;
-        return {level.pixels + level.stride * y + x, level.stride, static_cast<int16_t>((p.x - floor_x) * kPixelUnit),
-                static_cast<int16_t>((p.y - floor_y) * kPixelUnit)};
+        const int left = static_cast<int>(p.x), top = static_cast<int>(p.y);  // points inside are not negative
+        x = left - half_, y = top - half_;
+        return {level.pixels + level.stride * y + x, level.stride,
+                static_cast<int16_t>((p.x - static_cast<float>(left)) * kPixelUnit),
+                static_cast<int16_t>((p.y - static_cast<float>(top)) * kPixelUnit)};
     }
 
     // Prepares the comparison at a point; the curvature changes only where another part of the patch is inside.
