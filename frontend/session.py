@@ -12,13 +12,14 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.detectors import find_corners
 from seamark.frontend.masks import Mask
+from seamark.frontend.parallax import triangulate_tracks
 from seamark.frontend.pose import PoseEstimate, Prediction, motion_covariance
 from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.residuals import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import TrackAges, Tracks
-from seamark.frontend.two_view import normalised_rays, triangulate
+from seamark.frontend.two_view import normalised_rays
 from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
 
 OUTLIER_PX = 4.0
@@ -216,30 +217,16 @@ class Session:
         newest = self.reference
         todo = ~(self.landmarks.spread(newest.track_ids) < TRIANGULATED_SPREAD)
         todo |= np.isnan(self.landmarks.get(newest.track_ids)[:, 0])
-        for older in self.window[:-1]:  # the oldest view first: the widest angle
-            shared, mine, theirs = np.intersect1d(
-                newest.track_ids, older.track_ids, assume_unique=True, return_indices=True
-            )
-            use = todo[mine]
-            if not use.any():
-                continue
-            mine, theirs, shared = mine[use], theirs[use], shared[use]
-            points, angle = triangulate(
-                older.T_odom_cam,
-                normalised_rays(older.pixels[theirs], self.camera),
-                newest.T_odom_cam,
-                normalised_rays(newest.pixels[mine], self.camera),
-            )
-            good = np.isfinite(points[:, 0]) & (angle > np.deg2rad(self.config.triangulation_min_angle_deg))
-            for keyframe, rows in ((older, theirs), (newest, mine)):
-                seen = se3.transform(se3.inverse(keyframe.T_odom_cam), np.where(good[:, None], points, 0))
-                good &= seen[:, 2] > 1e-3
-                safe = np.where(good[:, None], seen, [0, 0, 1])
-                error = np.linalg.norm(self.camera.project_ideal(safe) - keyframe.pixels[rows], axis=1)
-                good &= error < self.config.pnp_threshold_px
-            spread = self.config.pixel_sigma / (self.camera.fx * np.maximum(angle[good], 1e-6))
-            self.landmarks.set(shared[good], points[good], spread)
-            todo[mine[good]] = False
+        c = self.config
+        rows, points, angle = triangulate_tracks(
+            newest,
+            self.window[:-1],
+            todo,
+            self.camera,
+            min_angle_rad=np.deg2rad(c.triangulation_min_angle_deg),
+            threshold_px=c.pnp_threshold_px,
+        )
+        self.landmarks.set(newest.track_ids[rows], points, c.pixel_sigma / (self.camera.fx * np.maximum(angle, 1e-6)))
 
     def adjust_window(self) -> None:
         """Bundle-adjust the window and forget landmarks that do not fit; keyframes held still and the oldest poses
