@@ -129,7 +129,7 @@ class Frontend:
         if pose is None:
             return self._recover(session, frame, image)
         settled = tracker.settle(session, image, tracks, pose.T_odom_cam)
-        better, keep_better = tracker.estimate(session, self._sensor, frame, settled)
+        better, keep_better = tracker.estimate(session, self._sensor, frame, settled, pose)
         if better is not None:
             pose, keep, tracks = better, keep_better, settled
         watch.lap("settle")

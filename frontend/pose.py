@@ -56,28 +56,24 @@ def estimate_pose(
     minimum: int,
     prediction: Prediction | None = None,
     votes: NDArray[np.float64] | None = None,
+    start: PoseEstimate | None = None,
 ) -> PoseEstimate | None:
     """Estimate the pose; None when fewer than ``minimum`` landmarks agree.
 
     P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`refine_pose` twice, the second time on the inliers of
     the refined pose. With a prediction, landmarks of uncertain distance take part: they hold the rotation, and the
     translation across their line of sight. ``votes`` (N,) weigh the landmarks where they disagree: then what the others
-    agree on, and what is predicted, stand for election beside the largest consensus.
+    agree on, and what is predicted, stand for election beside the largest consensus. A ``start``, the pose of the same
+    landmarks when their pixels were hardly different, is refined without sampling.
     """
     if len(observations.landmarks) < max(4, minimum):
         return None
-    sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
-    starts = []
-    if len(sample) < 2 * minimum:  # too few to sample from: what is predicted is another place to start from
-        if prediction is not None:
-            starts.append((prediction.T_odom_cam, np.ones(len(observations.landmarks), bool)))
-        sample = np.arange(len(observations.landmarks))
     votes = np.ones(len(observations.landmarks)) if votes is None else votes
-    starts += _sample_consensus(observations, sample, camera, threshold_px, iterations, minimum)
-    if starts and prediction is not None and votes[starts[-1][1]].sum() < CONTESTED_SHARE * votes.sum():
-        others = sample[~starts[-1][1][sample]]
-        starts.append((prediction.T_odom_cam, np.ones(len(observations.landmarks), bool)))
-        starts += _sample_consensus(observations, others, camera, threshold_px, iterations, minimum)
+    if start is not None:
+        starts = [(start.T_odom_cam, start.inliers)]
+    else:
+        sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
+        starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, prediction, votes)
     best, best_score = None, np.inf
     for T_odom_cam, inliers in starts:
         found = _converge(
@@ -94,6 +90,31 @@ def estimate_pose(
         if found is not None and found[1] < best_score:
             best, best_score = found
     return best
+
+
+def _starts(
+    observations: Observations,
+    sample: NDArray[np.int64],
+    camera: Camera,
+    threshold_px: float,
+    iterations: int,
+    minimum: int,
+    prediction: Prediction | None,
+    votes: NDArray[np.float64],
+) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    """Return the poses to start from, with the landmarks (N,) that speak for each."""
+    starts = []
+    everything = np.ones(len(observations.landmarks), bool)
+    if len(sample) < 2 * minimum:  # too few to sample from: what is predicted is another place to start from
+        if prediction is not None:
+            starts.append((prediction.T_odom_cam, everything))
+        sample = np.arange(len(observations.landmarks))
+    starts += _sample_consensus(observations, sample, camera, threshold_px, iterations, minimum)
+    if starts and prediction is not None and votes[starts[-1][1]].sum() < CONTESTED_SHARE * votes.sum():
+        others = sample[~starts[-1][1][sample]]
+        starts.append((prediction.T_odom_cam, everything))
+        starts += _sample_consensus(observations, others, camera, threshold_px, iterations, minimum)
+    return starts
 
 
 def _sample_consensus(

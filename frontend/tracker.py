@@ -79,9 +79,12 @@ def follow(session: Session, before: Pyramid, after: Pyramid, *, predict: bool) 
 
 
 def estimate(
-    session: Session, sensor: DepthSensor, frame: Frame, tracks: Tracks
+    session: Session, sensor: DepthSensor, frame: Frame, tracks: Tracks, start: PoseEstimate | None = None
 ) -> tuple[PoseEstimate | None, NDArray[np.bool_]]:
-    """Estimate the pose from the tracks with a landmark; returns it and which tracks (N,) it does not refute."""
+    """Estimate the pose from the tracks with a landmark; returns it and which tracks (N,) it does not refute.
+
+    ``start`` is the pose of the same tracks before their pixels were settled.
+    """
     c = session.config
     unknown = np.full(len(tracks), np.nan)
     # Depth images are read for free at every frame; a stereo match costs as much as the tracking and waits for
@@ -97,6 +100,7 @@ def estimate(
         minimum=c.min_inliers,
         prediction=session.prediction(),
         votes=static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera),
+        start=start,
     )
     keep = np.ones(len(tracks), bool)
     if pose is not None:
