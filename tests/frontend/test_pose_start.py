@@ -12,7 +12,7 @@ SETTINGS = {"threshold_px": 2.5, "iterations": 150, "pixel_sigma": 0.7, "minimum
 
 
 def test_a_start_gives_the_pose_that_sampling_gives() -> None:
-    """Test: the pixels move by up to a pixel, a third are wrong. Expected: the same pose and inliers as from nothing."""
+    """Test: the pixels move a little, a third are wrong. Expected: the same pose and inliers as from nothing."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-3, 3, (120, 2)), rng.uniform(3, 9, 120)])
     pixels = CAMERA.project_ideal(points) + rng.normal(size=(120, 2)) * 1.0
