@@ -260,7 +260,7 @@ def inject(courses: Sequence[str], seeds: Sequence[int], mode: Mode | None, imag
                     injected = false_loops(made, clean, share, consistent, seed)
                     dirty = run(made, BackendConfig(), injected)
                     pairs = {(query, pair[0].id) for query, pairs in injected.items() for pair in pairs}
-                    taken = sum((j.loop.query_id, j.loop.match_id) in pairs for j in dirty.judged)
+                    taken = sum(j.false and (j.loop.query_id, j.loop.match_id) in pairs for j in dirty.judged)
                     cells = [
                         f"{course} {seed}",
                         f"{share:.0%}",
