@@ -199,3 +199,31 @@ def test_same_seed_same_bits(world, move):
     first, second = verify(query, match, CONFIG, 3), verify(query, match, CONFIG, 3)
     assert first.T_match_query.tobytes() == second.T_match_query.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def test_a_pose_that_few_far_points_leave_free_is_refused(world, move):
+    """Test: 20 points 25 m away in the middle of the image. Expected: refused, because the pose could swing."""
+    w = world(22, 20, low=-2.6, high=2.6, near=24.9, far=25.1)
+    noise = {"noise_px": 1.0, "depth_noise": 0.02}
+    query, match = w.view(move((0, 0.01, 0), (0.3, 0, 0)), **noise), w.view(np.eye(4), **noise)
+    result = verify(query, match, CONFIG, 1)
+    assert isinstance(result, Rejected)
+    assert result.reason == Reason.BAD_GEOMETRY
+    assert result.evidence.gates[-1].name in ("rotation_sigma_deg", "translation_sigma_per_depth")
+    assert not result.evidence.gates[-1].passed
+    # The same with many points near by is held.
+    near = world(22, 400, low=-5, high=5, near=4, far=9)
+    assert isinstance(verify(near.view(move((0, 0.01, 0), (0.3, 0, 0))), near.view(np.eye(4)), CONFIG, 1), Verification)
+
+
+def test_repeated_ground_and_strange_objects_are_refused_by_what_is_missing(world, move):
+    """Test: a tenth of what must be visible is there again, the rest is other things. Expected: CONTRADICTED."""
+    same, there, here = world(23, 60), world(24, 900), world(25, 900)
+    truth = move((0, 0.02, 0), (0.1, 0, 0.1))
+    match = joined(same.view(np.eye(4), clutter=0), there.view(np.eye(4), clutter=0))
+    query = joined(same.view(truth, clutter=0), here.view(truth, clutter=0))
+    result = verify(query, match, CONFIG, 1)
+    assert isinstance(result, Rejected)
+    assert result.reason == Reason.CONTRADICTED
+    assert result.evidence.gates[-1].name == "confirmed"
+    assert len(result.evidence.missing) > 400
