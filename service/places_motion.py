@@ -16,7 +16,7 @@ NO_SESSION: Final = -1
 NEAR_M: Final = 2.0  # between two views of one place
 DRIFT_SHARE: Final = 0.01  # of the path between them; odometry with depth errs by a third of that at most
 MONO_SHARE: Final = 0.1  # without a scale the path is the only measure
-MOST_TURN: Final = float(np.deg2rad(45))
+MOST_TURN: Final = float(np.deg2rad(40))
 AGREES, UNKNOWN, CONTRADICTS = 1, 0, -1
 
 
@@ -36,7 +36,7 @@ class Motion:
         """Return for each of ``places`` (M,), other images, whether ``image`` can show it: (M,) int8.
 
         CONTRADICTS where both poses are of one session and farther apart than two views of one place and the drift on
-        the way between them explain, or turned by more than 45 degrees; AGREES where they are not; UNKNOWN where a pose
+        the way between them explain, or turned by more than 40 degrees; AGREES where they are not; UNKNOWN where a pose
         is missing or the sessions differ.
         """
         here, there = self.T_odom_cam[image], self.T_odom_cam[places]
