@@ -72,7 +72,7 @@ def test_landmarks_of_either_side_suffice(world, move, side):
 
 @pytest.mark.parametrize(("noise_px", "depth_noise"), [(0.3, 0.002), (1.0, 0.002), (0.5, 0.03)])
 def test_covariance_is_that_of_the_errors(world, move, noise_px, depth_noise):
-    """Test: 40 pairs with noise in both images and depths, which nobody tells. Expected: chi squared near 6.
+    """Test: 25 pairs with noise in both images and depths, which nobody tells. Expected: chi squared near 6.
 
     With what neighbours share and what no number of matches averages out, which are not in this world: less.
     """
@@ -80,7 +80,7 @@ def test_covariance_is_that_of_the_errors(world, move, noise_px, depth_noise):
         shared_px=0, shared_depth=0, rotation_systematic=0, translation_systematic=0, rotation_floor_deg=1e-6
     )
     values, cautious = [], []
-    for seed in range(40):
+    for seed in range(25):
         w, truth = world(seed, 500), move(W, T)
         match = w.view(np.eye(4), noise_px=noise_px, depth_noise=depth_noise)
         query = w.view(truth, noise_px=noise_px, depth_noise=depth_noise, depth=seed % 2 == 0)
