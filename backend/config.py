@@ -179,8 +179,8 @@ class MapConfig(_Section):
     )
     place_m: float = Field(default=1.0, gt=0, description="views nearer to each other may stand for one another")
     place_deg: float = Field(default=20.0, gt=0, description="views whose directions differ by less may do so")
-    alike: float = Field(
-        default=0.25, gt=0, le=1, description="likeness of brightness and colour from which two views show one lighting"
+    lighting: float = Field(
+        default=0.12, gt=0, le=1, description="views whose mean colours differ by less (0..1) show one lighting"
     )
 
 

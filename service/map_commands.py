@@ -15,6 +15,7 @@ EXIT_DAMAGED = 3
 map_app = typer.Typer(no_args_is_help=True, help="Map files: look at them, check, repair, export and prune them.")
 
 MapArgument = Annotated[Path, typer.Argument(help="The map file.")]
+OverrideOption = Annotated[list[str] | None, typer.Option("-o", metavar="KEY=VALUE", help="Set section.key=value.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -86,3 +87,31 @@ def export_command(
         print_json({"out": str(out), "format": form, **written})
     else:
         typer.echo(f"{out}: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in written.items()))
+
+
+@map_app.command("prune")
+def prune_command(
+    map_file: MapArgument,
+    keyframes: Annotated[int, typer.Option("--keyframes", min=1, help="Views to keep, as far as places allow.")],
+    override: Annotated[
+        list[str] | None, typer.Option("-o", metavar="KEY=VALUE", help="Set section.key=value.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Forget redundant views of a map that no service is writing; each place keeps one of each lighting."""
+    import os
+
+    from seamark.backend.map_prune import choose, views_of
+    from seamark.backend.map_store import MapStore
+    from seamark.service.config import load_config
+
+    config = load_config(None, os.environ, override or []).backend.map
+    with MapStore(map_file) as store:
+        joined = [(loop.query_id, loop.match_id) for loop in store.load_loops() if loop.accepted]
+        pruning = choose(views_of(store), keyframes, joined, config)
+        store.forget(pruning.forget)
+        store.compact()
+    if as_json:
+        print_json({"forgotten": len(pruning.forget), "kept": pruning.kept, "wanted": pruning.wanted})
+    else:
+        typer.echo(f"{map_file}: {len(pruning.forget)} views forgotten, {pruning.kept} kept, {keyframes} wanted")

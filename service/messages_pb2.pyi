@@ -334,6 +334,14 @@ class Empty(_message.Message):
     schema_version: int
     def __init__(self, schema_version: _Optional[int] = ...) -> None: ...
 
+class Forget(_message.Message):
+    __slots__ = ("schema_version", "keyframe_ids")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    KEYFRAME_IDS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    keyframe_ids: Array
+    def __init__(self, schema_version: _Optional[int] = ..., keyframe_ids: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
+
 class Done(_message.Message):
     __slots__ = ("schema_version", "node")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]

@@ -94,3 +94,10 @@ class Status:
     cpu_s: float
     counters: dict[str, int] = field(default_factory=dict)
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Forget:
+    """Keyframes (N,) int64 whose views the map has given up: they are no places any more."""
+
+    keyframe_ids: NDArray[np.int64]

@@ -11,7 +11,7 @@ from enum import StrEnum
 from seamark import SeamarkError
 from seamark.backend.types import Loop, MapSnapshot
 from seamark.frontend.types import Frame, Keyframe, Odometry
-from seamark.service.requests import Done, Empty, PlaceQuery, PlaceReply, Status
+from seamark.service.requests import Done, Empty, Forget, PlaceQuery, PlaceReply, Status
 from seamark.vocab.types import Candidates, PlaceObservation
 
 ROOT = "seamark/v1"
@@ -139,6 +139,17 @@ CANDIDATES = Topic(
     "The ranked places for one keyframe; acknowledged once verified and in the map.",
     recorded=True,
 )
+FORGET = Topic(
+    "forget",
+    "forget",
+    Kind.ACKED,
+    Forget,
+    BACKEND,
+    (VOCAB,),
+    16,
+    "Views that the map has given up for its budget; acknowledged once they are no places any more.",
+    recorded=True,
+)
 CAMERA = Topic(
     "camera",
     "camera",
@@ -241,6 +252,7 @@ TOPICS: tuple[Topic, ...] = (
     ODOMETRY,
     KEYFRAME,
     CANDIDATES,
+    FORGET,
     LOOP,
     MAP,
     MAP_SNAPSHOT,

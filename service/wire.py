@@ -14,7 +14,7 @@ from seamark import SeamarkError
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Loss, Odometry, Outcome, Quality
 from seamark.service import messages_pb2 as pb
-from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery, PlaceReply, Status
+from seamark.service.requests import Done, Empty, EncodedFrame, Forget, PlaceError, PlaceQuery, PlaceReply, Status
 from seamark.service.wire_fields import (
     Array,
     Blob,
@@ -256,6 +256,7 @@ SCHEMAS: dict[type, Schema] = {
         PlaceReply,
     ),
     Empty: Schema(pb.Empty, {}, Empty),
+    Forget: Schema(pb.Forget, {"keyframe_ids": _IDS}, Forget),
     Done: Schema(pb.Done, {"node": Text()}, Done),
     Status: Schema(
         pb.Status,

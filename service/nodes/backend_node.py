@@ -5,9 +5,13 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 
+import numpy as np
+
 from seamark import __version__
+from seamark.backend.config import MapConfig
 from seamark.backend.errors import MapError, MapUnwritableError
 from seamark.backend.graph_types import Solver
+from seamark.backend.map_prune import KEEP_SHARE, budget, choose, views_of
 from seamark.backend.map_store import FEATURES, MapStore
 from seamark.backend.slam import Slam, StepResult
 from seamark.backend.solver import SolverProcess
@@ -23,10 +27,11 @@ from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.requests import Done
+from seamark.service.requests import Done, Forget
 from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
+PRUNE_EVERY = 20  # keyframes
 
 
 class BackendNode:
@@ -49,10 +54,12 @@ class BackendNode:
         solver: Solver | None = None,
         patient: bool = False,
         frozen: bool = False,
+        limits: MapConfig | None = None,
     ) -> None:
         self._bus, self._slam, self._no_loops, self._solver = bus, slam, no_loops, solver
         self._meter = Meter(bus.node)
         self._keeper = None if store is None else MapKeeper(store, self._meter, patient=patient, frozen=frozen)
+        self._limits = limits or MapConfig()
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
         self._known: set[int] = set()
@@ -184,6 +191,8 @@ class BackendNode:
             with self._meter.timed("map"):
                 result = self._slam.step(keyframe, candidates)
             self._tell(result, keyframe_id, mapped)
+            if self._keeper is not None and keyframe_id % PRUNE_EVERY == 0:
+                self._prune(self._keeper)
         except Exception as error:
             mapped.set_exception(error)
             raise
@@ -202,6 +211,21 @@ class BackendNode:
         if snapshot is not None:
             self._meter.count("optimisations")
             self._bus.publish(topics.MAP, snapshot)
+
+    def _prune(self, keeper: MapKeeper) -> None:
+        """Keep the map within its budget; it is looked at now and then, because counting reads the file."""
+        keep = budget(keeper.store, self._limits)
+        if keep is None or keeper.store.file.read_only:
+            return
+        with self._meter.timed("prune"):
+            keep = budget(keeper.store, self._limits, KEEP_SHARE) or keep
+            joined = ((loop.query_id, loop.match_id) for loop in keeper.store.load_loops() if loop.accepted)
+            pruning = choose(views_of(keeper.store), keep, joined, self._limits)
+        self._meter.keep("views_over_budget", max(0, pruning.kept - pruning.wanted))
+        if pruning.forget and keeper.forget(pruning.forget):
+            self._slam.forget(pruning.forget)
+            self._bus.send(topics.FORGET, Forget(np.array(pruning.forget, np.int64)))
+            self._meter.count("views_forgotten", len(pruning.forget))
 
     def _rank(self, observation: PlaceObservation) -> Candidates:
         self._meter.count("place_queries")
@@ -233,6 +257,7 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
             solver=solver,
             patient=settings.patient,
             frozen=settings.localise_only,
+            limits=config.backend.map,
         )
     except BaseException:
         if solver is not None:

@@ -3,7 +3,7 @@
 import logging
 import shutil
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
 
 from seamark.backend.errors import MapError, MapUnwritableError
@@ -86,6 +86,16 @@ class MapKeeper:
                     raise
             else:
                 self._recover()
+
+    def forget(self, keyframe_ids: Sequence[int]) -> bool:
+        """Delete the views of keyframes; return False, and leave them, where the disk does not even take that."""
+        with self._lock:
+            try:
+                self.store.forget(keyframe_ids)
+            except MapUnwritableError as error:
+                self._degrade(error)
+                return False
+        return True
 
     def close(self) -> None:
         """Try once more to write what is not on disk yet, and close the map; what was not acknowledged may be lost."""

@@ -13,7 +13,7 @@ from seamark.service.bus import Bus, TimedOutError
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.requests import Done
+from seamark.service.requests import Done, Forget
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import Candidates, PlaceObservation
 from seamark.vocab.vocabulary import Vocabulary
@@ -42,6 +42,7 @@ class VocabNode:
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
         bus.handle(topics.PROGRESS[bus.node], lambda _: self._meter.status())
         bus.handle(topics.PLACES_RANK, self._on_rank, workers=1)
+        bus.handle(topics.FORGET, self._on_forget)
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 
     def stop(self) -> None:
@@ -63,6 +64,14 @@ class VocabNode:
         self._meter.count("keyframes_again" if known else "keyframes")
         self._remember(observation)
         return self._bus.send(topics.CANDIDATES, candidates)
+
+    def _on_forget(self, forget: Forget) -> None:
+        with self._lock:
+            for number in forget.keyframe_ids.tolist():
+                if number in self._index:
+                    self._index.remove(number)
+                    self._meter.count("places_forgotten")
+        self._meter.keep("places", len(self._index))
 
     def _remember(self, observation: PlaceObservation) -> None:
         self._next_keyframe_id = max(self._next_keyframe_id, observation.id + 1)
@@ -98,7 +107,8 @@ def build(bus: Bus, settings: NodeSettings) -> VocabNode:
     if settings.map_path is None or not settings.restore:
         return VocabNode(bus, index)
     with MapStore(settings.map_path, read_only=True) as store:
-        return VocabNode(bus, index, (observe(keyframe) for keyframe in store.load_keyframes()))
+        ids = store.keyframe_ids(recognisable=True)
+        return VocabNode(bus, index, (observe(store.keyframe(number)) for number in ids))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from seamark import SeamarkError
+from seamark.backend.config import MapConfig
 from seamark.backend.map_store import MapStore
 from seamark.backend.slam import StepResult
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
@@ -400,3 +401,39 @@ def test_a_keyframe_sent_again_is_ranked_and_not_added_again(vocabulary: Vocabul
     assert ranked == [1, 1, 0]
     counters = bus.request(topics.STATUS["vocab"], Empty()).counters
     assert counters == {"places": 2, "keyframes": 1, "keyframes_again": 2, "next_keyframe_id": 2}
+
+
+def test_a_budget_is_kept_and_the_vocabulary_forgets_too(vocabulary: Vocabulary, tmp_path: Path) -> None:
+    """Test: 41 like views come in, room is for 10. Expected: the newest stay in file, index and memory."""
+    bus, slam = LocalBus(), FakeSlam()
+    slam.forgotten: list[int] = []  # type: ignore[misc]
+    slam.forget = slam.forgotten.extend  # type: ignore[attr-defined]
+    index = PlaceIndex(vocabulary)
+    VocabNode(bus.for_node("vocab"), index)
+    store = MapStore(tmp_path / "map.seamark")
+    limits = MapConfig(keyframes=10)
+    node = BackendNode(bus.for_node("backend"), slam, store, FrontendConfig(), limits=limits)
+    rng = np.random.default_rng(0)
+    T = np.eye(4)
+    for number in range(41):
+        seen = Features(
+            rng.random((20, 2)).astype(np.float32),
+            np.ones(20, np.float32),
+            np.ones(20, np.float32),
+            rng.integers(0, 256, (20, 128)).astype(np.uint8),
+        )
+        landmarks = np.zeros((20, 3), np.float32)
+        one = replace(keyframe(number), stamp_ns=10**10 * number, features=seen, landmarks=landmarks, T_odom_cam=T)
+        bus.send(topics.KEYFRAME, one)
+        bus.drain()
+        ids = np.arange(number + 1)
+        poses = np.tile(T, (number + 1, 1, 1))
+        store.update_poses(MapSnapshot(1, ids, ids * 0, ids * 0, poses, np.ones(number + 1), ()))
+    bus.drain()
+    kept = store.keyframe_ids(recognisable=True)
+    assert 9 <= len(kept) <= 10 + 20 and len(store.keyframe_ids()) == 41
+    assert [number in index for number in range(41)] == [number in kept for number in range(41)]
+    assert sorted(slam.forgotten) == sorted(set(range(41)) - set(kept))  # type: ignore[attr-defined]
+    counters = bus.request(topics.STATUS["backend"], Empty()).counters
+    assert counters["views_forgotten"] == 41 - len(kept) and counters["views_over_budget"] == 0
+    node.close()

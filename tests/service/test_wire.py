@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Odometry, Outcome, Quality
 from seamark.service import messages_pb2 as pb
-from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery, PlaceReply, Status
+from seamark.service.requests import Done, Empty, EncodedFrame, Forget, PlaceError, PlaceQuery, PlaceReply, Status
 from seamark.service.topics import TOPICS
 from seamark.service.wire import SCHEMA_VERSION, SCHEMAS, WireError, decode, encode, encoding_of
 from seamark.vocab.confidence import Verdict
@@ -101,6 +101,7 @@ def messages() -> list[Any]:
         Odometry(0, 0, "", -1, Quality.LOST, Outcome.UNREADABLE),
         Candidates(-1, 5, (Candidate(1, 0.5, 0.25, float("nan")), Candidate(0, 0.1, 0, 3, 0.75))),
         Candidates(3, 5, ()),
+        Forget(np.array([3, 1, 4], np.int64)),
         PlaceObservation(1, 0, 9, np.zeros((2, 128), np.uint8), np.zeros((2, 2), np.float32), grey),
         loop(),
         loop(False),
