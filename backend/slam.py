@@ -60,6 +60,7 @@ class Slam:
             judge = PoseJudge(self._chains, config.consistency)
         self._ledger = LoopLedger(judge)
         self._map = MapState()
+        self._unsolved = False
         self._memory = KeyframeMemory(config.map.memory_mb << 20, load)
         self._loops: dict[Key, Loop] = {}
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
@@ -91,6 +92,9 @@ class Slam:
 
         # Commit what is accepted, withdraw what no longer is, and solve.
         started = time.perf_counter()
+        if self._unsolved and self._solver is not None:
+            self._unsolved = False
+            self._solver.request()
         committed = self._commit([key for key in changed if self._loops[key].accepted != (key in self._committed)])
         optimised = self._collect(self._config.graph.solve_wait_ms / 1e3 if committed else 0.0)
         timings_ms["optimise"] = 1e3 * (time.perf_counter() - started)
@@ -135,7 +139,7 @@ class Slam:
             constraints = [constraint for constraint in accepted.values() if constraint is not None]
             self._solver.restore([node for node in nodes if node is not None], constraints, self._map.estimate())
             self._committed |= set(accepted)
-            self._solver.request()  # what was accepted after the last solution; nobody waits for it
+            self._unsolved = bool(accepted)  # loops may have come after the last solution: the next keyframe asks
             return
         for node in nodes:
             if self._solver is not None and node is not None:

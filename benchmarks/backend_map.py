@@ -1,0 +1,213 @@
+"""The map in numbers: commit latency, bytes per keyframe, opening after a kill, and the same loop driven fifty times.
+
+    .venv/bin/python benchmarks/backend_map.py commit --keyframes 500
+    .venv/bin/python benchmarks/backend_map.py recover --keyframes 10000
+    .venv/bin/python benchmarks/backend_map.py laps --laps 50
+
+Keyframes are synthetic: descriptors of the length and density of RootSIFT, 800 a picture, a JPEG of 60 kB of noise. Of
+one place the descriptors are the same up to noise, so that recognition has something to recognise.
+"""
+
+import argparse
+import json
+import os
+import signal
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from seamark.backend.config import BackendConfig, MapConfig, VerificationConfig
+from seamark.backend.map_prune import KEEP_SHARE, budget, choose, views_of
+from seamark.backend.map_store import FEATURES, MapStore
+from seamark.backend.slam import Slam
+from seamark.backend.solver import SolverProcess
+from seamark.backend.types import MapSnapshot
+from seamark.frontend.camera import Camera
+from seamark.frontend.types import Features, Keyframe, Mode
+from seamark.vocab.config import VocabConfig
+from seamark.vocab.place_index import PlaceIndex
+from seamark.vocab.types import Candidates, PlaceObservation
+from seamark.vocab.vocabulary import Vocabulary
+
+COUNT = 800
+LAP_COUNT = 300  # features of a picture where it is driven round and round: what grows does not depend on it
+JPEG_BYTES = 60_000
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+RADIUS_M = 12.0
+
+
+def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
+    raw = rng.gamma(0.6, 1.0, (count, 128))
+    return np.round(255 * np.sqrt(raw / raw.sum(axis=1, keepdims=True)).clip(0, 1)).astype(np.uint8)
+
+
+def place(number: int, noise_seed: int = 0, count: int = COUNT) -> tuple[Features, np.ndarray, np.ndarray]:
+    """Return features, landmarks and thumbnail of a place, seen with the noise of one visit."""
+    rng, noise = np.random.default_rng(number), np.random.default_rng((number, noise_seed))
+    landmarks = rng.uniform((-3, -2, 3), (3, 2, 9), (count, 3))
+    points = landmarks[:, :2] / landmarks[:, 2:] * 500 + (320, 240) + noise.normal(0, 0.4, (count, 2))
+    shifted = descriptors(rng, count).astype(np.int16) + noise.integers(-6, 7, (count, 128))
+    seen = Features(
+        points.astype(np.float32),
+        np.full(count, 8, np.float32),
+        np.zeros(count, np.float32),
+        shifted.clip(0, 255).astype(np.uint8),
+    )
+    thumbnail = np.random.default_rng(number + 7).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    return seen, landmarks.astype(np.float32), thumbnail
+
+
+def pose(step: int, per_lap: int) -> np.ndarray:
+    angle = 2 * np.pi * step / per_lap
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    T[:3, 3] = (RADIUS_M * np.sin(angle), 0, RADIUS_M * (np.cos(angle) - 1))
+    return T
+
+
+def keyframe(number: int, per_lap: int, seed: int = 0, count: int = COUNT) -> Keyframe:
+    seen, landmarks, thumbnail = place(number % per_lap, seed, count)
+    return Keyframe(
+        id=number,
+        session=0,
+        index=number,
+        stamp_ns=10**9 * number,
+        file=str(number),
+        features=seen,
+        landmarks=landmarks,
+        thumbnail=thumbnail,
+        jpeg=np.random.default_rng(number).bytes(JPEG_BYTES),
+        camera=CAMERA,
+        previous_id=number - 1 if number else None,
+        T_odom_cam=pose(number, per_lap),
+        covariance=np.diag([1e-6] * 3 + [1e-5] * 3),
+    )
+
+
+def percentiles(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99)}
+
+
+def commit(folder: Path, count: int) -> dict[str, object]:
+    path, taken = folder / "map.seamark", []
+    with MapStore(path) as store:
+        for number in range(count):
+            one = keyframe(number, 200)
+            started = time.perf_counter()
+            store.add_keyframe(one)
+            taken.append(1e3 * (time.perf_counter() - started))
+    return {"commit_ms": percentiles(taken), "bytes_per_keyframe": path.stat().st_size // count, "keyframes": count}
+
+
+def recover(folder: Path, count: int) -> dict[str, object]:
+    """Fill a map, kill its writer in the midst of it, and open it as the back end does."""
+    path = folder / "map.seamark"
+    template = keyframe(0, 200)
+    child = os.fork()
+    if child == 0:
+        store = MapStore(path)
+        store.file.database.execute("PRAGMA synchronous = OFF")  # only here: the file is not what is measured
+        for number in range(count):
+            previous = number - 1 if number else None
+            T = pose(number, 200)
+            store.add_keyframe(replace(template, id=number, previous_id=previous, T_odom_cam=T, jpeg=b"x" * JPEG_BYTES))
+        ids = np.arange(count)
+        T = np.stack([pose(number, 200) for number in range(count)])
+        store.record((), MapSnapshot(1, ids, ids * 0, ids * 0, T, np.ones(count), ()), {"mapped": str(count - 1)})
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    os.sync()  # two gigabytes on their way to the disk are not what is measured
+    first, again = open_as_the_back_end(path, count), open_as_the_back_end(path, count)
+    return {"keyframes": count, "file_mb": round(path.stat().st_size / 1e6), "first": first, "again": again}
+
+
+def open_as_the_back_end(path: Path, count: int) -> dict[str, float]:
+    """Return how long it takes until a place query could be verified."""
+    started, cpu = time.perf_counter(), time.process_time()
+    store, solver = MapStore(path), SolverProcess(BackendConfig())
+    slam = Slam(BackendConfig(), Mode.RGBD, solver, 0, lambda number: store.keyframe(number, (FEATURES,)))
+    slam.restore(store.load_nodes(), store.load_loops(), store.load_poses(), int(store.meta()["revision"]))
+    wall_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu
+    assert len(slam.snapshot().keyframe_ids) == count
+    solver.close()
+    store.close()
+    return {"wall_s": round(wall_s, 2), "cpu_s": round(cpu_s, 2)}
+
+
+def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, object]]:
+    """Drive the same loop again and again with room for ``keep`` views; one row per tenth lap."""
+    path, rows = folder / "map.seamark", []
+    limits = MapConfig(keyframes=keep, memory_mb=4)
+    config = BackendConfig(map=limits, verification=VerificationConfig(candidates=1))
+    vocabulary = Vocabulary.default()
+    index = PlaceIndex(vocabulary, VocabConfig(exclude_recent_s=20.0))
+    solver = SolverProcess(config)
+    with MapStore(path) as store:
+        slam = Slam(config, Mode.RGBD, solver, 0, lambda number: store.keyframe(number, (FEATURES,)))
+        for lap in range(count):
+            found, query_ms, step_ms = 0, [], []
+            for step in range(per_lap):
+                one = keyframe(lap * per_lap + step, per_lap, lap, LAP_COUNT)
+                observation = PlaceObservation(
+                    one.id, 0, one.stamp_ns, one.features.descriptors, one.features.points, one.thumbnail
+                )
+                store.add_keyframe(one)
+                started = time.perf_counter()
+                candidates: Candidates = index.step(observation)
+                query_ms.append(1e3 * (time.perf_counter() - started))
+                started = time.perf_counter()
+                result = slam.step(one, candidates)
+                step_ms.append(1e3 * (time.perf_counter() - started))
+                snapshot = slam.snapshot() if result.optimised else None
+                store.record(result.loops, snapshot, {"mapped": str(one.id)})
+                found += any(loop.accepted and loop.match_id % per_lap == step for loop in result.loops)
+                if one.id % 20 == 0 and budget(store, config.map) is not None:
+                    store.update_poses(slam.snapshot())
+                    wanted = budget(store, config.map, KEEP_SHARE) or keep
+                    pruning = choose(views_of(store), wanted, (), config.map)
+                    store.forget(pruning.forget)
+                    slam.forget(pruning.forget)
+                    for number in pruning.forget:
+                        index.remove(number)
+            if lap in (1, 4) or lap % 10 == 9:
+                row = {
+                    "lap": lap + 1,
+                    "keyframes": (lap + 1) * per_lap,
+                    "views": len(store.keyframe_ids(recognisable=True)),
+                    "recall": round(found / per_lap, 3),
+                    "query_ms": percentiles(query_ms),
+                    "step_ms": percentiles(step_ms),
+                    "rss_mb": round(psutil.Process().memory_info().rss / 1e6),
+                    "disk_mb": round((path.stat().st_size) / 1e6, 1),
+                }
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+    solver.close()
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("commit", "recover", "laps"))
+    parser.add_argument("--keyframes", type=int, default=500)
+    parser.add_argument("--laps", type=int, default=50)
+    parser.add_argument("--per-lap", type=int, default=25)
+    parser.add_argument("--keep", type=int, default=60)
+    parser.add_argument("--folder", type=Path, help="Where maps are made; default: the folder for temporary files.")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        if options.what == "commit":
+            print(json.dumps(commit(Path(folder), options.keyframes)))
+        elif options.what == "recover":
+            print(json.dumps(recover(Path(folder), options.keyframes)))
+        else:
+            laps(Path(folder), options.laps, options.per_lap, options.keep)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
