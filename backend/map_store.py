@@ -159,11 +159,15 @@ class MapStore:
             database.executemany(upsert("landmarks"), [sealed("landmarks", row) for row in rows])
 
     def forget(self, keyframe_ids: Iterable[int]) -> None:
-        """Delete features, landmarks and images of keyframes; their poses, edges and loops stay."""
+        """Delete features, landmarks and images of keyframes, and the evidence of the loops that they asked for.
+
+        Poses, edges and loops stay.
+        """
         ids = [(int(number),) for number in keyframe_ids]
         with self.file.writing() as database:
             for table in BLOB_TABLES:
                 database.executemany(f"DELETE FROM {table} WHERE keyframe_id = ?", ids)
+            database.executemany("DELETE FROM evidence WHERE query_id = ?", ids)
 
     def keyframe_ids(self, recognisable: bool = False) -> list[int]:
         """Return the ids of all keyframes, or of those that have features, ascending."""
