@@ -109,8 +109,16 @@ def greedy_clique(agree: NDArray[np.bool_], weights: NDArray[np.float64], starts
     """Return the members (N,) of a heavy clique of the graph ``agree`` (N, N), weighted by ``weights`` (N,).
 
     Greedy from the ``starts`` nodes with most agreeing weight: of the nodes that agree with all members, the one with
-    most weight among them joins. Deterministic; ties go to the lower index.
+    most weight among them joins. Deterministic; ties go to the lower index. Nodes that agree with all others are
+    members of every such clique and need no search.
     """
+    torn = np.flatnonzero(~agree.all(axis=1))
+    if 0 < len(torn) < len(agree):
+        best = np.ones(len(agree), bool)
+        best[torn] = greedy_clique(agree[np.ix_(torn, torn)], weights[torn], starts)
+        return best
+    if len(torn) == 0:
+        return np.ones(len(agree), bool)
     linked = agree & ~np.eye(len(agree), dtype=bool)
     degree = linked @ weights + weights
     best, best_weight = np.zeros(len(agree), bool), -1.0

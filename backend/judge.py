@@ -18,8 +18,9 @@ from seamark.backend.config import ConsistencyConfig
 from seamark.backend.consistency import greedy_clique, pair_chi2
 from seamark.backend.graph_types import Constraint
 from seamark.backend.ledger import Finding
+from seamark.backend.step_table import StepTable
 from seamark.backend.types import Reason
-from seamark.backend.ways import ALL_AXES, PLANAR_AXES, Way, Ways
+from seamark.backend.ways import ALL_AXES, LOOP_STEPS, PLANAR_AXES, Way, Ways
 
 # A way that leaves less than this of the volume that odometry alone leaves has something of its own to say.
 TELLING_VOLUME: Final = 0.1
@@ -60,7 +61,7 @@ class PoseJudge:
     def __init__(self, chains: OdometryChains, config: ConsistencyConfig, planar: bool = False) -> None:
         self._chains, self._config, self._planar = chains, config, planar
         self._findings: list[Finding] = []
-        self._numbers: dict[tuple[int, int], list[int]] = {}  # sessions -> findings
+        self._tables: dict[tuple[int, int], StepTable] = {}  # sessions -> findings
         self._group_of: list[int] = []
         self._groups: dict[int, Group] = {}
         self._ways = Ways(chains, PLANAR_AXES if planar else ALL_AXES)
@@ -71,6 +72,8 @@ class PoseJudge:
         before = {number: self._verdict(group) for number, group in self._groups.items()}
         joined = {self._join(finding) for finding in findings}
         entered = [self._groups[number] for number in sorted(joined) if number in self._groups]
+        for group in entered:
+            self._describe(group)
         # What joins an accepted group is accepted with it; a group that is confirmed by now calls for a judgement.
         called = [group for group in entered if not group.accepted and self._confirmed(group)]
         if len(called) == 1 and self._admissible(called[0], self._way(called[0], self._accepted())):
@@ -85,7 +88,9 @@ class PoseJudge:
 
     def restore(self, finding: Finding) -> None:
         """See :class:`~seamark.backend.ledger.Judge`."""
-        self._groups[self._join(finding)].accepted = True
+        group = self._groups[self._join(finding)]
+        group.accepted = True
+        self._describe(group)
 
     def _verdict(self, group: Group) -> Reason:
         if group.accepted:
@@ -100,25 +105,32 @@ class PoseJudge:
     def _join(self, finding: Finding) -> int:
         """Put a finding into the group it belongs to, which may join groups; return the group's number."""
         number = len(self._findings)
-        others = self._nearest_findings(finding)
+        others, apart = self._neighbours(finding)
         self._findings.append(finding)
-        self._numbers.setdefault(finding.sessions, []).append(number)
         self._group_of.append(number)
         group = self._groups[number] = Group(number, [number])
         votes: dict[int, int] = {}
         if others:
             loops = [self._constraint(other) for other in others]
-            chi2, steps = pair_chi2([self._constraint(number)] * len(loops), loops, self._chains)
-            near = (steps <= self._config.support_keyframes).all(axis=1)
-            agrees = chi2 <= self._config.pair_chi2
-            for k in np.flatnonzero(near).tolist():
-                other = self._group_of[others[k]]
-                votes[other] = votes.get(other, 0) + (1 if agrees[k] else -1)
+            chi2, _ = pair_chi2([self._constraint(number)] * len(loops), loops, self._chains)
+            for other, agrees in zip(others, (chi2 <= self._config.pair_chi2).tolist(), strict=True):
+                votes[self._group_of[other]] = votes.get(self._group_of[other], 0) + (1 if agrees else -1)
         for other_group in sorted(k for k, vote in votes.items() if vote > 0):
             group = self._merge(self._groups[other_group], group)
-        self._ways.add(number, self._constraint(number))
-        self._describe(group)
+        # Ways need no loop that runs beside another of its group.
+        beside = (apart < LOOP_STEPS / 2) & np.array([self._group_of[other] == group.number for other in others], bool)
+        if not beside.any():
+            self._ways.add(number, self._constraint(number))
         return group.number
+
+    def _neighbours(self, finding: Finding) -> tuple[list[int], NDArray[np.int64]]:
+        """Return the nearest findings of the same sessions within reach, and how many steps (K,) they are away."""
+        table = self._tables.setdefault(finding.sessions, StepTable())
+        steps = (self._chains.step(finding.query_id), self._chains.step(finding.match_id))
+        numbers, apart = table.near(steps, self._config.support_keyframes)
+        table.append(len(self._findings), steps)
+        order = np.argsort(apart, kind="stable")[: self._config.compared_loops]
+        return numbers[order].tolist(), apart[order]
 
     def _merge(self, one: Group, other: Group) -> Group:
         """Move all members into the older group and return it."""
@@ -134,7 +146,7 @@ class PoseJudge:
         """Say anew who speaks for the group and how much it weighs."""
         ordered = sorted(group.members, key=lambda number: self._findings[number].key)
         group.middle = ordered[len(ordered) // 2]
-        group.odometry = self._ways.test(self._constraint(group.middle), lambda _: False)
+        group.odometry = self._ways.odometry(self._constraint(group.middle))
         strain = 0.0 if group.odometry is None else group.odometry.chi2 / self._config.gate_chi2
         group.weight = self._extent(ordered) * (1 - 0.5 * min(strain, 1.0))
 
@@ -148,15 +160,6 @@ class PoseJudge:
             stretch = (self._chains.step(finding.query_id) - first) // self._config.support_keyframes
             stretches[stretch] = stretches.get(stretch, 0.0) + min(finding.inliers, strong) / strong
         return float(np.sqrt(list(stretches.values())).sum())
-
-    def _nearest_findings(self, finding: Finding) -> list[int]:
-        """Return the findings of the same sessions nearest to this one."""
-        numbers = self._numbers.get(finding.sessions, [])
-        if len(numbers) <= self._config.compared_loops:
-            return numbers.copy()
-        keys = np.array([self._findings[i].key for i in numbers])
-        distances = np.abs(keys - np.array(finding.key)).sum(axis=1)
-        return [numbers[i] for i in np.argsort(distances, kind="stable")[: self._config.compared_loops]]
 
     def _nearest_groups(self, centres: Sequence[Group]) -> list[Group]:
         """Return the accepted and the confirmed groups nearest to these, these included, by number."""
@@ -282,7 +285,7 @@ class PoseJudge:
         agree = np.ones((len(groups), len(groups)), bool)
         middles = [group.middle for group in groups]
         sessions = [self._findings[number].sessions for number in middles]
-        pairs = [(i, j) for i in range(len(groups)) for j in range(i) if sessions[i] == sessions[j]]
+        pairs = [(i, j) for i, j in self._near_pairs(middles) if sessions[i] == sessions[j]]
         unknown = [(i, j) for i, j in pairs if (middles[i], middles[j]) not in self._agree]
         if unknown:
             ones, others = ([self._constraint(middles[pair[k]]) for pair in unknown] for k in (0, 1))
@@ -292,3 +295,13 @@ class PoseJudge:
         for i, j in pairs:
             agree[i, j] = agree[j, i] = self._agree[middles[i], middles[j]]
         return agree
+
+    def _near_pairs(self, middles: Sequence[int]) -> list[tuple[int, int]]:
+        """Return pairs i > j, each group with the nearest ones only: odometry says little of those far away."""
+        keys = np.array([self._findings[number].key for number in middles]).reshape(-1, 2)
+        pairs: set[tuple[int, int]] = set()
+        for i in range(1, len(keys)):
+            distances = np.abs(keys[:i] - keys[i]).sum(axis=1)
+            nearest = np.argsort(distances, kind="stable")[: self._config.compared_loops]
+            pairs |= {(i, j) for j in nearest.tolist()}
+        return sorted(pairs)

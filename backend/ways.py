@@ -67,11 +67,19 @@ class Ways:
                 stops = self._stops[self._session(keyframe_id)]
                 del stops[bisect_left(stops, self._stop(keyframe_id))]
 
+    def odometry(self, loop: Constraint) -> Way | None:
+        """Return the way through odometry alone; None between sessions."""
+        if self._session(loop.query_id) != self._session(loop.match_id):
+            return None
+        return self._along_hops(loop, [(loop.match_id, loop.query_id, None)])
+
     def test(self, loop: Constraint, passable: Callable[[int], bool]) -> Way | None:
         """Return the shortest way for a loop, through passable loops only; None where there is none."""
         hops = self._shortest(loop.match_id, loop.query_id, passable)
-        if hops is None:
-            return None
+        return None if hops is None else self._along_hops(loop, hops)
+
+    def _along_hops(self, loop: Constraint, hops: list[Hop]) -> Way:
+        """Return the way along these hops, from the loop's match to its query."""
         S, covariance, scale_variance = np.eye(4), np.zeros((6, 6)), 0.0
         for hop in reversed(hops):  # S maps the query's frame into the hop's end
             T, part, part_scale = self._hop(hop)

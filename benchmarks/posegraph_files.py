@@ -151,3 +151,74 @@ def kitti(folder: Path, name):
     """Return the graph and the true poses of one KITTI sequence's folder."""
     truth = truth_of(folder / f"kitti_{folder.name}_GT.g2o")
     return read_g2o(folder / f"kitti_{folder.name}_{name}.g2o"), truth
+
+
+def sphere(rings, per_ring):
+    """Return true poses on a sphere of 50 m and the loops from each node to the one a ring below."""
+    k = np.arange(rings * per_ring)
+    height = np.pi * (k / len(k) * 0.9 + 0.05)
+    around = 2 * np.pi * k / per_ring
+    points = 50 * np.stack([np.sin(height) * np.cos(around), np.sin(height) * np.sin(around), np.cos(height)], axis=1)
+    return _along(points, points), [(i - per_ring, i) for i in k[per_ring:].tolist()]
+
+
+def torus(rings, per_ring):
+    """Return true poses on a torus and the loops from each node to the one a ring before."""
+    k = np.arange(rings * per_ring)
+    u, v = 2 * np.pi * k / per_ring, 2 * np.pi * k / len(k)
+    points = np.stack([(30 + 10 * np.cos(u)) * np.cos(v), (30 + 10 * np.cos(u)) * np.sin(v), 10 * np.sin(u)], axis=1)
+    centre = 30 * np.stack([np.cos(v), np.sin(v), 0 * v], axis=1)
+    return _along(points, points - centre), [(i - per_ring, i) for i in k[per_ring:].tolist()]
+
+
+def city(nodes, street, rng, every=5, side=12):
+    """Return true planar poses of a drive through a square city and loops where a street is driven again."""
+    directions = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    corner, heading, truth, loops, seen = np.zeros(2, int), 0, [], [], {}
+    while len(truth) < nodes:
+        for step in range(street):
+            position = corner * street + directions[heading] * step
+            turn = se3.exp_rotation(np.array([0, 0, heading * np.pi / 2]))
+            k = len(truth)
+            truth.append(se3.make(turn, np.array([*position, 0.0])))
+            before = seen.setdefault(tuple(position), k)
+            if k - before > 50 and k % every == 0:
+                loops.append((before, k))
+        corner = corner + directions[heading]
+        ways = [(heading + turn) % 4 for turn in (-1, 0, 1)]
+        ways = [w for w in ways if (corner + directions[w] >= 0).all() and (corner + directions[w] <= side).all()]
+        heading = int(rng.choice(ways))
+    return np.array(truth[:nodes]), [pair for pair in loops if pair[1] < nodes]
+
+
+def measured(truth, loops, rng, planar, metres, radians):
+    """Return the graph that odometry and loops of this noise measure; the noise is as the covariances say."""
+    pairs = [(k, k + 1) for k in range(len(truth) - 1)] + list(loops)
+    a, b = np.array(pairs).T
+    T = np.linalg.inv(truth[a]) @ truth[b]
+    T = T @ np.array([pose(rng, metres, radians, planar) for _ in pairs])
+    sigmas = np.array([radians] * 3 + [metres] * 3)
+    if planar:
+        sigmas[[0, 1, 5]] = 1e-3
+    return GraphFile(
+        planar=planar,
+        node_ids=np.arange(len(truth)),
+        T_vertex=np.full((len(truth), 4, 4), np.nan),
+        from_ids=a,
+        to_ids=b,
+        T_from_to=T,
+        covariances=np.repeat(np.diag(sigmas**2)[None], len(pairs), axis=0),
+        ignored={},
+    )
+
+
+def _along(points, up):
+    """Return poses that look along a curve."""
+    forward = np.gradient(points, axis=0)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    left = np.cross(up, forward)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    out = np.tile(np.eye(4), (len(points), 1, 1))
+    out[:, :3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=2)
+    out[:, :3, 3] = points
+    return out
