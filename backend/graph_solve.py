@@ -22,6 +22,8 @@ from seamark.backend.ways import ALL_AXES, PLANAR_AXES
 # 99.9 per cent of chi squared with 3 and 6 degrees of freedom.
 PLANAR_CHI2: Final = 16.27
 SPATIAL_CHI2: Final = 22.46
+# What is accepted here has passed sharper tests than a residual: the kernel is there for what is left.
+CAUCHY_WIDTH: Final = 3.0
 # Loops whose ends are this many nodes apart can support each other: nodes are frames here, not keyframes.
 SUPPORT_NODES: Final = 20
 # Live, the noise is estimated anew whenever the number of loops has doubled, first at this one.
@@ -73,7 +75,8 @@ def graph_config(base: BackendConfig, planar: bool) -> BackendConfig:
     consistency = base.consistency.model_copy(
         update={"gate_chi2": chi2, "pair_chi2": chi2, "support_keyframes": SUPPORT_NODES}
     )
-    return base.model_copy(update={"drift": drift, "consistency": consistency})
+    graph = base.graph.model_copy(update={"cauchy_width": CAUCHY_WIDTH})
+    return base.model_copy(update={"drift": drift, "consistency": consistency, "graph": graph})
 
 
 def solve_graph(graph: GraphFile, live: bool = False, config: BackendConfig | None = None) -> GraphSolution:

@@ -117,9 +117,9 @@ class PoseJudge:
                 votes[self._group_of[other]] = votes.get(self._group_of[other], 0) + (1 if agrees else -1)
         for other_group in sorted(k for k, vote in votes.items() if vote > 0):
             group = self._merge(self._groups[other_group], group)
-        # Ways need no loop that runs beside another of its group.
-        beside = (apart < LOOP_STEPS / 2) & np.array([self._group_of[other] == group.number for other in others], bool)
-        if not beside.any():
+        # Ways need no loop that runs beside another one of its group through which they lead.
+        beside = (other for other, steps in zip(others, apart.tolist(), strict=True) if steps < LOOP_STEPS / 2)
+        if not any(other in self._ways and self._group_of[other] == group.number for other in beside):
             self._ways.add(number, self._constraint(number))
         return group.number
 

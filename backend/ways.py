@@ -48,6 +48,9 @@ class Ways:
         self._at: dict[int, set[int]] = {}  # keyframe -> loops that end there
         self._stops: dict[int, list[tuple[int, int]]] = {}  # session -> (step, keyframe), ascending
 
+    def __contains__(self, number: int) -> bool:
+        return number in self._loops
+
     def add(self, number: int, loop: Constraint) -> None:
         """Open a loop for ways."""
         self._loops[number] = loop

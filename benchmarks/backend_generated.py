@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/backend_generated.py [sphere torus grid city10 city30] [--false 0.2] [--gnc]
 
-Noise is as the covariances say. ``--false``: this share of all loops is replaced by groups of false ones. LM starts from
+Noise is as the covariances say. ``--false``: this share of all loops are groups of false ones. LM starts from
 odometry, its loops are Gaussian; GNC (truncated least squares) knows that odometry is sound. CPU seconds, one core.
 """
 
