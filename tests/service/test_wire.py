@@ -153,7 +153,8 @@ def test_every_message_type_is_tried_and_every_topic_can_be_sent() -> None:
 
 def test_every_field_of_every_dataclass_travels() -> None:
     for kind, schema in SCHEMAS.items():
-        assert {field.name for field in dataclasses.fields(kind)} == set(schema.fields), kind
+        local = {"evidence"} if kind is Loop else set()  # it goes from the back end to the map and nowhere else
+        assert {field.name for field in dataclasses.fields(kind)} - local == set(schema.fields), kind
 
 
 def test_arrays_arrive_read_only() -> None:
