@@ -134,7 +134,7 @@ class Frontend:
             pose, keep, tracks = better, keep_better, settled
         watch.lap("settle")
 
-        session.move(frame.stamp_ns, pose.T_odom_cam, tracks[keep])
+        session.move(frame.stamp_ns, pose.T_odom_cam, tracks[keep], pose.reprojection_px)
         ages = session.ages.of(session.tracks.ids)
         moving = (
             self._motion.step(image.grey, frame.stamp_ns, pose.T_odom_cam, session.distance()) if self._motion else None

@@ -26,6 +26,10 @@ OUTLIER_PX = 4.0
 LIVE_KEYFRAMES = 2  # the newest of the window, whose landmarks are tracked still if they are seen
 TRIANGULATED_SPREAD = 0.2  # a distance less certain than this is triangulated anew where two views allow it
 NEAR_SPREAD = 0.1  # of the distance: what is known so well holds the translation
+NOISE_UPDATE = 0.1  # weight of the newest frame in the running noise
+START_NOISE_PX = 1.0
+GATE_NOISES = 4.0
+NARROWEST_GATE_PX = 0.7
 PREDICTION_SHARE = 0.5  # of the last step and
 PREDICTION_OF_DEPTH = 0.02  # of the depth of the scene: how far constant velocity may be wrong
 
@@ -54,6 +58,7 @@ class Session:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     last_pose_stamp_ns: int = 0
     n_at_keyframe: int = 0
+    noise_px: float = START_NOISE_PX
     next_track_id: int = 0
     ages: TrackAges = field(default_factory=TrackAges)
 
@@ -73,8 +78,12 @@ class Session:
         """Begin tracks at new corners of a grey image where there are none and the mask is not zero."""
         self.new_tracks(find_corners(grey, self.tracks.pixels, self.config, mask))
 
-    def move(self, stamp_ns: int, T_odom_cam: NDArray[np.float64], tracks: Tracks) -> None:
-        """Take a new pose and the tracks seen from it."""
+    def move(
+        self, stamp_ns: int, T_odom_cam: NDArray[np.float64], tracks: Tracks, reprojection_px: float | None = None
+    ) -> None:
+        """Take a new pose, the tracks seen from it, and the median error of those that agree with it."""
+        if reprojection_px is not None:
+            self.noise_px += NOISE_UPDATE * (reprojection_px - self.noise_px)
         self.velocity = se3.inverse(self.T_odom_cam) @ T_odom_cam
         self.T_odom_cam = T_odom_cam
         self.tracks = tracks
@@ -93,6 +102,13 @@ class Session:
         origin = self.reference.T_odom_cam[:3, 3]
         measured = inverse_depth[known], inverse_sigma[known]
         return Observations(positions[known], pixels[known], *measured, spread, origin), known
+
+    def gate_px(self) -> float:
+        """Return how far a landmark may be seen from where it should be, by the noise of late: what moves slowly or
+        along with the camera stays close.
+        """
+        limit = self.config.pnp_threshold_px
+        return float(np.clip(GATE_NOISES * self.noise_px, min(NARROWEST_GATE_PX, limit), limit))
 
     def prediction(self) -> Prediction:
         """Return where constant velocity puts the camera next, and how far that may be wrong."""

@@ -25,6 +25,7 @@ MIN_DEPTH = 1e-3
 MAX_LOG_SCALE = 1.1  # a patch that has grown or shrunk threefold in area is another one
 MIN_CORRELATION = 0.8
 MAX_SETTLING_PX = 1.5
+MAJORITY = 0.5  # of the votes; where fewer agree within the noise of late, the noise may have grown
 
 
 def predict_pixels(session: Session, tracks: Tracks) -> NDArray[np.float32]:
@@ -91,17 +92,22 @@ def estimate(
     # keyframes.
     reading = sensor.inverse_depth(frame, tracks.pixels) if isinstance(sensor, DepthImage) else (unknown, unknown)
     observations, known = session.observations(tracks, *reading)
-    pose = estimate_pose(
-        observations,
-        session.camera,
-        threshold_px=c.pnp_threshold_px,
-        iterations=c.pnp_iterations,
-        pixel_sigma=c.pixel_sigma,
-        minimum=c.min_inliers,
-        prediction=session.prediction(),
-        votes=static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera),
-        start=start,
-    )
+    votes = static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera)
+    pose = None
+    for threshold_px in (session.gate_px(), c.pnp_threshold_px):
+        pose = estimate_pose(
+            observations,
+            session.camera,
+            threshold_px=threshold_px,
+            iterations=c.pnp_iterations,
+            pixel_sigma=c.pixel_sigma,
+            minimum=c.min_inliers,
+            prediction=session.prediction(),
+            votes=votes,
+            start=start,
+        )
+        if pose is not None and votes[pose.inliers].sum() > MAJORITY * votes.sum():
+            break
     keep = np.ones(len(tracks), bool)
     if pose is not None:
         keep[np.flatnonzero(known)[~pose.inliers]] = False

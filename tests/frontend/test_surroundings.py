@@ -55,7 +55,7 @@ def worst_error(odometry: list[Odometry], truth: np.ndarray) -> float:
     )
 
 
-@pytest.mark.parametrize("share", [0.2, 0.3])
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.4])
 def test_a_figure_that_walks_through_the_picture_does_not_drag_the_pose(share: float) -> None:
     """Test: 16 frames of a lap, with and without a figure before the camera, with depth and texture of its own.
 
