@@ -25,6 +25,7 @@ def follow(
     top: int,
     back_top: int,
     level: str | None = None,
+    level_out: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 def strongest(
     image: NDArray[np.uint8], cell: int, border: int, harris_k: float, mask: NDArray[np.uint8] | None

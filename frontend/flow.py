@@ -1,8 +1,8 @@
 """Pyramidal Lucas-Kanade with a guess, a forward-backward check and a look at the patch that was found.
 
-Bouguet 2001, Baker and Matthews 2004, Kalal et al. 2010. Patches are compared after their means are taken off, and only
-where both lie inside their images. The loops are in native/flow.cpp, in whole numbers: every processor gives the same
-bits.
+Bouguet 2001, Baker and Matthews 2004, Kalal et al. 2010. Patches are compared only where both lie inside their images.
+Their means are taken off only where the images differ in brightness: as long as the light stays, they tell something.
+The loops are in native/flow.cpp, in whole numbers: every processor gives the same bits.
 """
 
 import numpy as np
@@ -12,6 +12,7 @@ from seamark.frontend.kernels import native
 from seamark.frontend.pyramid import Pyramid
 
 BACK_LEVELS = 1  # the way back begins close to where it should end
+BRIGHTNESS_GREY = 8.0  # images whose means are farther apart differ in exposure, and patches lose their means
 
 
 def track(
@@ -33,8 +34,13 @@ def track(
     """
     start = np.ascontiguousarray(points, np.float32)
     first = start if guess is None else np.ascontiguousarray(guess, np.float32)
-    side = window_px // 2 * 2 + 1
-    there, round_trip, correlation = native.follow(before, after, start, first, side, levels, min(BACK_LEVELS, levels))
+    side, back = window_px // 2 * 2 + 1, min(BACK_LEVELS, levels)
+    changed = abs(_brightness(after) - _brightness(before)) > BRIGHTNESS_GREY
+    there, round_trip, correlation = native.follow(before, after, start, first, side, levels, back, level_out=changed)
     height, width = after.grey.shape
     inside = (there >= 0).all(axis=1) & (there <= [width - 1, height - 1]).all(axis=1)
     return there, inside & (round_trip < round_trip_px) & (correlation >= min_correlation)
+
+
+def _brightness(image: Pyramid) -> float:
+    return float(image.level(image.top).mean())

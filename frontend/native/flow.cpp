@@ -1,5 +1,5 @@
-// The slopes are those of the patch that is sought, computed once per point and level (Bouguet 2001), and its mean is taken off
-// (Baker and Matthews 2004): a change of brightness does not pull. Nothing beyond the border of either image does: only pixels
+// The slopes are those of the patch that is sought, computed once per point and level (Bouguet 2001). If wanted its mean
+// is taken off (Baker and Matthews 2004): then a change of brightness does not pull, and what the mean says is lost. Nothing beyond the border of either image does: only pixels
 // that lie in both with all that their interpolation and slopes need are compared.
 #include "flow.hpp"
 
@@ -37,8 +37,10 @@ bool inside(const Level& level, Point p) {
 // One patch of one image, sought in another.
 class Search {
 public:
-    Search(const Level& from, const Level& to, Point of, int half, const FlowKernels& kernels, Template& model)
-        : to_(to), half_(half), side_(2 * half + 1), kernels_(kernels), model_(model) {
+    Search(const Level& from, const Level& to, Point of, const FlowSettings& settings, const FlowKernels& kernels,
+           Template& model)
+        : to_(to), half_(settings.half), side_(2 * half_ + 1), level_out_(settings.level_out), kernels_(kernels),
+          model_(model) {
         int x, y;
         const Spot spot = spot_of(from, of, x, y);
         kernels.read(spot, side_, model_);
@@ -54,7 +56,7 @@ public:
             const Spot spot = look(there);
             if (!held_) return false;
             kernels_.mismatch(model_, spot, region_, sums);
-            const double off = sums[2] / pixels_, bx = sums[0] - off * slope_x_, by = sums[1] - off * slope_y_;
+            const double off = level_out_ ? sums[2] / pixels_ : 0, bx = sums[0] - off * slope_x_, by = sums[1] - off * slope_y_;
             const double step_x = (xy_ * by - yy_ * bx) / determinant_, step_y = (xy_ * bx - xx_ * by) / determinant_;
             there.x += static_cast<float>(step_x), there.y += static_cast<float>(step_y);
             if (!inside(to_, there)) return false;
@@ -109,7 +111,7 @@ private:
         pixels_ = static_cast<double>(range.right - range.left) * (range.bottom - range.top);
         int64_t sums[5];
         kernels_.curvature(model_, region_, sums);
-        slope_x_ = static_cast<double>(sums[3]), slope_y_ = static_cast<double>(sums[4]);
+        slope_x_ = level_out_ ? static_cast<double>(sums[3]) : 0, slope_y_ = level_out_ ? static_cast<double>(sums[4]) : 0;
         xx_ = sums[0] - slope_x_ * slope_x_ / pixels_;
         xy_ = sums[1] - slope_x_ * slope_y_ / pixels_;
         yy_ = sums[2] - slope_y_ * slope_y_ / pixels_;
@@ -120,6 +122,7 @@ private:
 
     const Level& to_;
     const int half_, side_;
+    const bool level_out_;
     const FlowKernels& kernels_;
     Template& model_;
     Range readable_, range_;
@@ -137,7 +140,7 @@ bool descend(const Pyramid& from, const Pyramid& to, Point of, Point& there, int
         Point at = {there.x * scale, there.y * scale};
         const Point begin = {of.x * scale, of.y * scale};
         const bool finest = level == 0;
-        Search search(from[level], to[level], begin, settings.half, kernels, model);
+        Search search(from[level], to[level], begin, settings, kernels, model);
         const bool precise = finest && likeness;
         const bool found = search.find(at, precise ? kPreciseStep : kCoarseStep, precise ? kPreciseSteps : kCoarseSteps);
         if (!found && finest) return false;

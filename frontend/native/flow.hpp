@@ -11,6 +11,7 @@ namespace seamark {
 struct FlowSettings {
     int half;           // side of the patch: 2 half + 1
     int top, back_top;  // highest levels on the way there and back
+    bool level_out;     // whether the mean of each patch is taken off
 };
 
 // Moves `there` (n, 2) in `after` from where it is to where the patch of `before` around `points` (n, 2) is seen.

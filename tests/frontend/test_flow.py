@@ -73,7 +73,7 @@ def test_a_guess_bridges_what_the_pyramid_cannot() -> None:
     settings = {**SETTINGS, "levels": 0}
     _, alone = flow.track(*pair, points, None, **settings)
     there, ok = flow.track(*pair, points, points + np.float32([68.5, 1]), **settings)
-    assert alone.mean() < 0.1 < 0.9 < ok.mean()
+    assert alone.mean() < 0.2 < 0.9 < ok.mean()
     assert np.abs(there[ok] - points[ok] - [70, 0]).max() < 0.3
 
 
