@@ -43,10 +43,24 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def with_other_focal_length(source: Path, folder: Path, factor: float) -> Path:
+    folder.mkdir()
+    for name in ("rgb", "depth", "associations.txt", "groundtruth.txt"):
+        (folder / name).symlink_to(source / name)
+    lines = (source / "calib.yaml").read_text().splitlines()
+    settings = dict(line.split(": ") for line in lines)
+    for key in ("fx", "fy"):
+        settings[key] = str(factor * float(settings[key]))
+    (folder / "calib.yaml").write_text("".join(f"{key}: {value}\n" for key, value in settings.items()))
+    return folder
+
+
 @pytest.mark.zenoh
 def test_rgbd_over_processes_closes_its_loop(toy_tum: Path, n_frames: int, tmp_path: Path) -> None:
+    """Test: one lap and a bit, with a focal length that is 1 % wrong. Expected: the loop corrects what that bends."""
     out = tmp_path / "out"
-    report = json.loads(seamark("run", toy_tum, "--out", out, "--json", *QUICK).stdout)
+    bent = with_other_focal_length(toy_tum, tmp_path / "bent", 1.01)
+    report = json.loads(seamark("run", bent, "--out", out, "--json", *QUICK).stdout)
     assert {path.name for path in out.iterdir()} == FILES
     assert report == json.loads((out / "report.json").read_text())
     assert report["mode"] == "rgbd"

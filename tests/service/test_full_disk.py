@@ -109,6 +109,7 @@ def test_a_full_disk_stops_learning_until_there_is_room(
         assert reply.error_code is None and reply.places[0].accepted
         filler.unlink()
         until(lambda: counter(launcher, "learning") == 1)
+        drain(launcher)  # what waited for room is sent before there is more
         sent += feed(launcher, frames[60:])
         drain(launcher)
         left_out = launcher.bus.request(topics.STATUS["frontend"], Empty()).counters.get("keyframes_left_out", 0)
