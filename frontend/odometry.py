@@ -126,8 +126,12 @@ class Frontend:
 
         pose, keep = tracker.estimate(session, self._sensor, frame, tracks)
         watch.lap("pose")
+        if pose is None or tracker.abrupt(session, pose):
+            recovered = self._recover(session, frame, image, pose)
+            if recovered is not None:
+                return recovered
         if pose is None:
-            return self._recover(session, frame, image)
+            return self._lose(session, frame, image)
         settled = tracker.settle(session, image, tracks, pose.T_odom_cam)
         better, keep_better = tracker.estimate(session, self._sensor, frame, settled, pose)
         if better is not None:
@@ -238,27 +242,27 @@ class Frontend:
             filled=filled,
         )
 
-    def _recover(self, session: Session, frame: Frame, image: Pyramid) -> Odometry:
-        """Flow has failed: descriptors against recent keyframes, else lost, after a while a new session."""
+    def _recover(self, session: Session, frame: Frame, image: Pyramid, by_flow: PoseEstimate | None) -> Odometry | None:
+        """Flow has failed, or holds little: descriptors against recent keyframes, None where they hold no more."""
         found = recover(frame, self._builder.recent(session.id), session.camera, self._config, session.prediction())
+        if found is None or (by_flow is not None and found.estimate.inliers.sum() <= by_flow.inliers.sum()):
+            return None
         session.tracks = Tracks.none()
-        if found is not None:
-            fresh = session.new_tracks(found.pixels)
-            session.landmarks.set(fresh.ids, found.landmarks, found.spread)
-            session.move(frame.stamp_ns, found.estimate.T_odom_cam, session.tracks)
-            session.velocity = np.eye(4)
-            keyframe_id = self._insert_keyframe(session, frame, image, found.estimate)
-            arrows = np.hstack([found.pixels, found.pixels])
-            return self._tracked(session, frame, found.estimate, Outcome.RECOVERED, keyframe_id, arrows, {})
+        fresh = session.new_tracks(found.pixels)
+        session.landmarks.set(fresh.ids, found.landmarks, found.spread)
+        session.move(frame.stamp_ns, found.estimate.T_odom_cam, session.tracks)
+        session.velocity = np.eye(4)
+        keyframe_id = self._insert_keyframe(session, frame, image, found.estimate)
+        arrows = np.hstack([found.pixels, found.pixels])
+        return self._tracked(session, frame, found.estimate, Outcome.RECOVERED, keyframe_id, arrows, {})
+
+    def _lose(self, session: Session, frame: Frame, image: Pyramid) -> Odometry:
+        """Nothing known is found: lost, and after a while a new session."""
+        session.tracks = Tracks.none()
         session.velocity = np.eye(4)
         if frame.stamp_ns - session.last_pose_stamp_ns < 1e9 * self._config.patience_s:
-            return report(
-                frame,
-                Outcome.LOST,
-                Quality.LOST,
-                session=session.id,
-                loss=loss_of(image.grey, self._config.min_corner_response),
-            )
+            loss = loss_of(image.grey, self._config.min_corner_response)
+            return report(frame, Outcome.LOST, Quality.LOST, session=session.id, loss=loss)
         self._end_session()
         return self._start(frame, image)
 

@@ -20,6 +20,7 @@ from seamark.frontend.window import WindowKeyframe
 GUESS_DEPTH = 1e3  # tracks without a landmark move as if far away: by the rotation only
 RETRY_SURVIVORS = 0.5
 STILL_PX = 1.0
+ABRUPT_SHARE = 0.25
 PATCH_PX = 5.0
 MIN_DEPTH = 1e-3
 MAX_LOG_SCALE = 1.1  # a patch that has grown or shrunk threefold in area is another one
@@ -112,6 +113,12 @@ def estimate(
     if pose is not None:
         keep[np.flatnonzero(known)[~pose.inliers]] = False
     return pose, keep
+
+
+def abrupt(session: Session, pose: PoseEstimate) -> bool:
+    """Return whether a pose rests on few of the last frame's tracks: after a jump, flow finds what is not there."""
+    inliers = int(pose.inliers.sum())
+    return inliers < session.config.good_inliers and inliers < ABRUPT_SHARE * len(session.tracks)
 
 
 def settle(session: Session, image: Pyramid, tracks: Tracks, T_odom_cam: NDArray[np.float64]) -> Tracks:
