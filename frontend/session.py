@@ -27,7 +27,6 @@ LIVE_KEYFRAMES = 2  # the newest of the window, whose landmarks are tracked stil
 TRIANGULATED_SPREAD = 0.2  # a distance less certain than this is triangulated anew where two views allow it
 NEAR_SPREAD = 0.1  # of the distance: what is known so well holds the translation
 NOISE_UPDATE = 0.1  # weight of the newest frame in the running noise
-START_NOISE_PX = 1.0
 GATE_NOISES = 4.0
 NARROWEST_GATE_PX = 0.7
 PREDICTION_SHARE = 0.5  # of the last step and
@@ -58,7 +57,7 @@ class Session:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     last_pose_stamp_ns: int = 0
     n_at_keyframe: int = 0
-    noise_px: float = START_NOISE_PX
+    noise_px: float | None = None
     next_track_id: int = 0
     ages: TrackAges = field(default_factory=TrackAges)
 
@@ -82,8 +81,10 @@ class Session:
         self, stamp_ns: int, T_odom_cam: NDArray[np.float64], tracks: Tracks, reprojection_px: float | None = None
     ) -> None:
         """Take a new pose, the tracks seen from it, and the median error of those that agree with it."""
-        if reprojection_px is not None:
+        if reprojection_px is not None and self.noise_px is not None:
             self.noise_px += NOISE_UPDATE * (reprojection_px - self.noise_px)
+        elif reprojection_px is not None:
+            self.noise_px = reprojection_px
         self.velocity = se3.inverse(self.T_odom_cam) @ T_odom_cam
         self.T_odom_cam = T_odom_cam
         self.tracks = tracks
@@ -108,6 +109,8 @@ class Session:
         along with the camera stays close.
         """
         limit = self.config.pnp_threshold_px
+        if self.noise_px is None:
+            return limit
         return float(np.clip(GATE_NOISES * self.noise_px, min(NARROWEST_GATE_PX, limit), limit))
 
     def prediction(self) -> Prediction:
