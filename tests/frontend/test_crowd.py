@@ -26,7 +26,8 @@ def renderer() -> None:
 def test_people_who_cross_the_picture_do_not_drag_the_pose() -> None:
     """Test: 34 frames of a walk in which people who cross come to hide 38 % of the picture.
 
-    Expected: every frame is tracked, and over 2 m the error stays below 10 cm (25 cm where the gate does not follow the noise).
+    Expected: every frame is tracked, and over 2 m the error stays below 10 cm (25 cm where the gate does not follow the
+    noise).
     """
     wanted = specification.parse("loop,trajectory=loop,frames=780,sensors=rgbd,image=320x240,crowd=40,labels=1")
     poses, stamps_ns = wanted.poses(), trajectory.stamps(wanted.frames, specification.FPS)
