@@ -59,7 +59,7 @@ def worst_error(odometry: list[Odometry], truth: np.ndarray) -> float:
 def test_a_figure_that_walks_through_the_picture_does_not_drag_the_pose(share: float) -> None:
     """Test: 16 frames of a lap, with and without a figure before the camera, with depth and texture of its own.
 
-    Expected: every frame is tracked, and the error stays within twice that without the figure and 3 cm (0.7 m for 40 %
+    Expected: every frame is tracked, and the error stays within twice that without the figure and 7 cm (0.7 m for 40 %
     where the larger number of tracks decides).
     """
     frames = seen(TRUTH[:16])
@@ -67,7 +67,7 @@ def test_a_figure_that_walks_through_the_picture_does_not_drag_the_pose(share: f
     assert np.mean([where.mean() for _, where in hidden]) == pytest.approx(share, abs=0.02)
     alone, crowded = track(frames), track([frame for frame, _ in hidden])
     assert {one.outcome for one in crowded[1:]} <= POSED
-    assert 0 < worst_error(crowded, TRUTH[:16]) < 2 * worst_error(alone, TRUTH[:16]) + 0.03
+    assert 0 < worst_error(crowded, TRUTH[:16]) < 2 * worst_error(alone, TRUTH[:16]) + 0.07
 
 
 def test_what_moves_before_a_camera_that_stands_is_in_the_mask() -> None:
