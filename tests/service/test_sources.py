@@ -388,11 +388,11 @@ class TestWorlds:
         assert [frame.stamp_ns for frame in got] == [0, 50_000_000, 100_000_000, 150_000_000]
         assert isinstance(got[0], Frame)
         assert got[0].depth is not None
+        closed.clear()
         mono = open_sources(["synth:loop"], mode="mono").frames()
         first = next(mono)
         assert isinstance(first, Frame)
         assert first.depth is None
-        closed.clear()
         mono.close()  # type: ignore[attr-defined]
         assert closed == [True]
 
