@@ -96,20 +96,21 @@ def parts_of(course: str, seed: int, image: str = "320x240") -> list[Part]:
     ]
 
 
-def _kept(folder: str, name: str) -> Path:
+def kept_file(folder: str, name: str) -> Path:
+    """Return where something that is dear to make is kept; its folder is there."""
     path = default_cache_dir() / folder / f"{name}.pickle"
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
-def _load(path: Path) -> Any:
+def load_kept(path: Path) -> Any:
     try:
         return pickle.loads(path.read_bytes())
     except (OSError, EOFError, pickle.UnpicklingError):
         return None
 
 
-def _store(path: Path, value: object) -> None:
+def store_kept(path: Path, value: object) -> None:
     partial = path.with_suffix(".partial")
     partial.write_bytes(pickle.dumps(value))
     partial.rename(path)
@@ -118,13 +119,13 @@ def _store(path: Path, value: object) -> None:
 def coded(part: Part) -> list[CodedFrame]:
     """Return the frames, rendered the first time."""
     wanted = specification.parse(part.text)
-    path = _kept(
+    path = kept_file(
         "courses", f"{specification.content_hash(wanted)}-{part.indices.start}-{part.indices.stop}-{part.indices.step}"
     )
-    frames = _load(path)
+    frames = load_kept(path)
     if frames is None:
         frames = list(render_some(wanted, list(part.indices)))
-        _store(path, frames)
+        store_kept(path, frames)
     return list(frames)
 
 
@@ -147,11 +148,11 @@ def replay(
     world = course.split("_")[0]
     mode = mode or (Mode.STEREO if world == "road" or course in DAYS else Mode.RGBD)
     name = f"{course}-{seed}-{mode}-{image}"
-    path = _kept("replays", f"{name}-{VERSION}")
-    found = _load(path)
+    path = kept_file("replays", f"{name}-{VERSION}")
+    found = load_kept(path)
     if found is None:
         found = _run(name, mode, parts_of(course, seed, image), vocabulary or Vocabulary.default())
-        _store(path, found)
+        store_kept(path, found)
     assert isinstance(found, Replay)
     return found
 

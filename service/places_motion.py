@@ -1,15 +1,17 @@
 """What odometry knows of places: whether the camera can have been where an image was taken before."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.frontend.camera import Rig
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.odometry import Frontend
-from seamark.frontend.types import Mode
+from seamark.frontend.types import Frame, Mode
 from seamark.service.sources.base import Source, Unreadable
 
 NO_SESSION: Final = -1
@@ -56,25 +58,28 @@ class Motion:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def follow(source: Source, config: FrontendConfig, progress: Callable[[int], None] | None = None) -> Motion | None:
+def follow(source: Source, config: FrontendConfig) -> Motion | None:
     """Return the motion of the camera as the front end sees it; None for a source without a calibration."""
     if source.mode is Mode.PLACES or source.rig is None or not source.n_frames:
         return None
-    poses = np.tile(np.eye(4), (source.n_frames, 1, 1))
-    sessions = np.full(source.n_frames, NO_SESSION, np.int64)
-    frontend = Frontend(source.rig, source.mode, config)
+    return motion_of(source.frames(), source.n_frames, source.rig, source.mode, config)
+
+
+def motion_of(
+    frames: Iterable[Frame | Unreadable], n_frames: int, rig: Rig, mode: Mode, config: FrontendConfig
+) -> Motion:
+    """Return the motion of the camera over the first ``n_frames`` frames as the front end sees it."""
+    poses = np.tile(np.eye(4), (n_frames, 1, 1))
+    sessions = np.full(n_frames, NO_SESSION, np.int64)
+    frontend = Frontend(rig, mode, config)
     try:
-        for number, frame in enumerate(source.frames()):
-            if number == source.n_frames:
-                break
+        for number, frame in enumerate(islice(frames, n_frames)):
             if number:
                 poses[number] = poses[number - 1]
             if not isinstance(frame, Unreadable):
                 said = frontend.step(frame).odometry
                 if said.T_odom_cam is not None:
                     poses[number], sessions[number] = said.T_odom_cam, said.session
-            if progress is not None:
-                progress(number + 1)
     finally:
         frontend.close()
-    return Motion(poses, sessions, source.mode is not Mode.MONO)
+    return Motion(poses, sessions, mode is not Mode.MONO)

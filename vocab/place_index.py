@@ -20,6 +20,7 @@ from seamark.vocab.vocabulary import Vocabulary, check_descriptors
 NANOSECONDS = 1_000_000_000
 NO_PLACE = -1
 NEAR_VOTES = signatures.vote_table()
+SAME_WORDS = 1e-4  # what sums of float32 may lack of 1
 COMPACT_FROM = 64  # removed places; fewer are kept, however few others there are
 
 
@@ -103,6 +104,35 @@ class PlaceIndex:
             self._table[slot]["live"] = False
             if self._inverted.n_slots > 2 * len(self._slot_of) + COMPACT_FROM:
                 self._compact()
+
+    def stamps(self) -> dict[int, tuple[int, int]]:
+        """Return session and stamp of every place by its id."""
+        self._read_opened()
+        live = self._table[list(self._slot_of.values())]
+        sessions, stamps_ns = live["session"].tolist(), live["stamp_ns"].tolist()
+        return dict(zip(self._slot_of, zip(sessions, stamps_ns, strict=True), strict=True))
+
+    def describes(self, observation: PlaceObservation) -> bool:
+        """Return whether the place of this id was made of just this observation, with these settings.
+
+        Raises:
+            ObservationError: arrays of the wrong shape or type.
+        """
+        slot = self._slot_of.get(observation.id)
+        if slot is None:
+            return False
+        self._read_opened()
+        looks, place = self._describe(observation), self._table[slot]
+        pairs = (
+            (looks.histograms.present, place["present"]),
+            (looks.histograms.values, place["values"]),
+            (looks.view.cells, place["cells"]),
+            (looks.view.totals, place["totals"]),
+        )
+        if (observation.session, observation.stamp_ns) != (place["session"], place["stamp_ns"]):
+            return False
+        alike = not len(looks.words) or self._inverted.votes(looks.words)[slot] > 1.0 - SAME_WORDS
+        return bool(alike) and all(np.array_equal(one, other) for one, other in pairs)
 
     def save(self, path: Path | str) -> None:
         """Write the index to a file, replacing an older one only when the new one is complete on disk.

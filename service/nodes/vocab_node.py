@@ -3,7 +3,6 @@
 import logging
 import sys
 import threading
-from collections.abc import Iterable
 from concurrent.futures import Future
 
 from seamark.backend.map_store import MapStore
@@ -11,6 +10,7 @@ from seamark.frontend.types import Keyframe
 from seamark.service import topics
 from seamark.service.bus import Bus, TimedOutError
 from seamark.service.nodes.meter import Meter
+from seamark.service.nodes.places_cache import PlacesCache, cache_path, observe, open_index
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Done, Forget
@@ -26,18 +26,22 @@ STOP_PATIENCE_S = 0.5
 class VocabNode:
     """Asks the index about every keyframe, then adds it; answers query images without adding them.
 
-    ``known`` are the places of the map from before, in the order in which they were seen.
+    ``index`` holds the places of the map from before; ``cache``, where there is one, keeps it in a file.
     """
 
-    def __init__(self, bus: Bus, index: PlaceIndex, known: Iterable[PlaceObservation] = ()) -> None:
+    def __init__(
+        self, bus: Bus, index: PlaceIndex, cache: PlacesCache | None = None, meter: Meter | None = None
+    ) -> None:
         self._bus = bus
         self._index = index
-        self._meter = Meter(bus.node)
+        self._cache = cache
+        self._meter = meter or Meter(bus.node)
         self._lock = threading.Lock()  # queries have a thread of their own: sending keyframes on may take a while
         self._next_keyframe_id = 0
-        for observation in known:
-            index.add(observation)
-            self._remember(observation)
+        for number in index.stamps():
+            self._next_keyframe_id = max(self._next_keyframe_id, number + 1)
+        if len(index):
+            self._count_places()
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
         bus.handle(topics.PROGRESS[bus.node], lambda _: self._meter.status())
@@ -53,7 +57,9 @@ class VocabNode:
             logger.warning("%s; they are given up, and so are their keyframes", error)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Keep the index for the next start."""
+        if self._cache is not None:
+            self._cache.close(self._index)
 
     def _on_keyframe(self, keyframe: Keyframe) -> "Future[None]":
         """Rank and add; the keyframe is acknowledged when its candidates are."""
@@ -61,8 +67,11 @@ class VocabNode:
         with self._lock, self._meter.timed("rank"):
             known = keyframe.id in self._index  # sent again after a restart
             candidates = self._index.query(observation) if known else self._index.step(observation)
+            if self._cache is not None and not known:
+                self._cache.changed(self._index)
         self._meter.count("keyframes_again" if known else "keyframes")
-        self._remember(observation)
+        self._next_keyframe_id = max(self._next_keyframe_id, observation.id + 1)
+        self._count_places()
         return self._bus.send(topics.CANDIDATES, candidates)
 
     def _on_forget(self, forget: Forget) -> None:
@@ -70,11 +79,12 @@ class VocabNode:
             for number in forget.keyframe_ids.tolist():
                 if number in self._index:
                     self._index.remove(number)
+                    if self._cache is not None:
+                        self._cache.changed(self._index)
                     self._meter.count("places_forgotten")
         self._meter.keep("places", len(self._index))
 
-    def _remember(self, observation: PlaceObservation) -> None:
-        self._next_keyframe_id = max(self._next_keyframe_id, observation.id + 1)
+    def _count_places(self) -> None:
         self._meter.keep("next_keyframe_id", self._next_keyframe_id)
         self._meter.keep("places", len(self._index))
 
@@ -87,28 +97,21 @@ class VocabNode:
         return Done(self._bus.node)
 
 
-def observe(keyframe: Keyframe) -> PlaceObservation:
-    """Return what place recognition needs of a keyframe."""
-    return PlaceObservation(
-        keyframe.id,
-        keyframe.session,
-        keyframe.stamp_ns,
-        keyframe.features.descriptors,
-        keyframe.features.points,
-        keyframe.thumbnail,
-    )
-
-
 def build(bus: Bus, settings: NodeSettings) -> VocabNode:
     """Return the node for the settings; raises VocabularyFileError, MapError."""
     path = settings.vocabulary
     vocabulary = Vocabulary.default() if path is None else Vocabulary.load(path)
-    index = PlaceIndex(vocabulary, settings.config.vocab)
-    if settings.map_path is None or not settings.restore:
-        return VocabNode(bus, index)
-    with MapStore(settings.map_path, read_only=True) as store:
-        ids = store.keyframe_ids(recognisable=True)
-        return VocabNode(bus, index, (observe(store.keyframe(number)) for number in ids))
+    if settings.map_path is None:
+        return VocabNode(bus, PlaceIndex(vocabulary, settings.config.vocab))
+    index, described = PlaceIndex(vocabulary, settings.config.vocab), 0
+    if settings.restore:
+        with MapStore(settings.map_path, read_only=True) as store:
+            index, described = open_index(store, vocabulary, settings.config.vocab)
+    meter = Meter(bus.node)
+    meter.keep("places_described_at_start", described)
+    kept = settings.patient and not settings.localise_only  # a run ends before anything would be gained
+    cache = PlacesCache(cache_path(settings.map_path), meter, described) if kept else None
+    return VocabNode(bus, index, cache, meter)
 
 
 if __name__ == "__main__":

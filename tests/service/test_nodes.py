@@ -23,7 +23,8 @@ from seamark.service import topics
 from seamark.service.bus import LocalBus, RemoteError
 from seamark.service.nodes.backend_node import BackendNode
 from seamark.service.nodes.frontend_node import FrontendNode
-from seamark.service.nodes.vocab_node import VocabNode, observe
+from seamark.service.nodes.places_cache import observe
+from seamark.service.nodes.vocab_node import VocabNode
 from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.training import train
@@ -395,7 +396,9 @@ def test_a_keyframe_sent_again_is_ranked_and_not_added_again(vocabulary: Vocabul
     bus, ranked = LocalBus(), []
     bus.for_node("backend").handle(topics.KEYFRAME, lambda _: None)
     bus.for_node("backend").handle(topics.CANDIDATES, lambda c: ranked.append(c.query_id))
-    VocabNode(bus.for_node("vocab"), PlaceIndex(vocabulary), [observe(keyframe(0))])
+    index = PlaceIndex(vocabulary)
+    index.add(observe(keyframe(0)))
+    VocabNode(bus.for_node("vocab"), index)
     for number in (1, 1, 0):
         bus.send(topics.KEYFRAME, keyframe(number))
         bus.drain()
