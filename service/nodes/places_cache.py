@@ -25,7 +25,8 @@ logger = logging.getLogger(__name__)
 
 SUFFIX: Final = ".places"
 COMPARED: Final = 16  # keyframes, evenly spread, that are described again to see whether the file is of this map
-LEAST_CHANGES, SHARE_OF_PLACES = 256, 0.1  # places that change before it is written again
+LEAST_CHANGES, SHARE_OF_PLACES = 256, 0.1
+"""So many places must have changed before the file is written: describing fewer again takes half a second."""
 
 
 class PlacesCache:
@@ -50,10 +51,10 @@ class PlacesCache:
             self._begin(index)
 
     def close(self, index: PlaceIndex) -> None:
-        """Write what has changed and wait for it."""
+        """Write what has changed, if it is worth it, and wait for it."""
         if self._writing is not None:
             self._writing.join()
-        if self._changes:
+        if self._changes >= LEAST_CHANGES:
             self._begin(index)
         if self._writing is not None:
             self._writing.join()

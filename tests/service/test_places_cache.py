@@ -31,6 +31,12 @@ def vocabulary_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(autouse=True)
+def every_change_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places_cache, "LEAST_CHANGES", 1)
+    monkeypatch.setattr(places_cache, "SHARE_OF_PLACES", 10.0)  # while it runs not at all, in these small maps
+
+
 def keyframe(number: int, world: int = 0) -> Keyframe:
     rng = np.random.default_rng((world, number))
     seen = Features(
@@ -150,6 +156,7 @@ def test_it_is_written_while_the_service_runs(
     tmp_path: Path, vocabulary_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(places_cache, "LEAST_CHANGES", 10)
+    monkeypatch.setattr(places_cache, "SHARE_OF_PLACES", 0.1)
     run = Run(tmp_path / "map.seamark", vocabulary_file)
     for number in range(12):
         run.bus.send(topics.KEYFRAME, keyframe(number))
@@ -162,6 +169,12 @@ def test_it_is_written_while_the_service_runs(
     left_over.write_bytes(b"half")
     assert Run(path, vocabulary_file).counters()["places_described_at_start"] == 2
     assert not left_over.exists()
+
+
+def test_a_small_map_gets_no_file(tmp_path: Path, vocabulary_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places_cache, "LEAST_CHANGES", COUNT + 1)
+    Run(fill(tmp_path, range(COUNT)), vocabulary_file).end()
+    assert [file.name for file in tmp_path.iterdir()] == ["map.seamark"]
 
 
 def flipped(at: float) -> Callable[[Path], object]:
