@@ -73,8 +73,10 @@ class OdometryChains:
         for k, (row, previous) in enumerate(zip(rows.tolist(), before.tolist(), strict=True)):
             if previous >= 0:
                 self._covariance_odom[row] = self._covariance_odom[previous] + moved[k]
-                self._walked[row] = self._walked[previous] + walked[k]
-                self._steps[row] = self._steps[previous] + 1
+                span = nodes[k].span
+                way, steps = (walked[k], 1) if span is None else (np.array([span.angle, span.length]), span.steps)
+                self._walked[row] = self._walked[previous] + way
+                self._steps[row] = self._steps[previous] + steps
         for row, node in zip(rows.tolist(), nodes, strict=True):
             self._nodes.append(node)
             self._rows[node.id] = self._last[node.session] = row
@@ -83,6 +85,10 @@ class OdometryChains:
         """Multiply the covariances of all motions, past and to come: odometry is worse than was thought."""
         self._inflation *= factor
         self._covariance_odom *= factor
+
+    def nodes(self) -> tuple[Node, ...]:
+        """Return all keyframes in the order in which they were appended."""
+        return tuple(self._nodes)
 
     def node(self, keyframe_id: int) -> Node:
         """Return the keyframe; raises BackendInputError when it is unknown."""
@@ -150,6 +156,8 @@ class OdometryChains:
 
 def white_covariance(node: Node, motion: Matrix, config: DriftConfig) -> Matrix:
     """Return the covariance (6, 6) of one motion that stands for noise and bias in a graph of white noise."""
+    if node.span is not None:
+        return _symmetric(config.covariance_inflation * node.covariance + node.span.drift)
     translation = config.translation_fraction if node.metric else config.mono_translation_fraction
     turning = config.rotation_fraction * float(se3.rotation_angle(motion[:3, :3])) + np.deg2rad(
         config.rotation_deg_per_keyframe
@@ -158,8 +166,7 @@ def white_covariance(node: Node, motion: Matrix, config: DriftConfig) -> Matrix:
     floor_translation = config.floor_translation_m if node.metric else 1e-3 * float(np.linalg.norm(motion[:3, 3]))
     floor = np.repeat([np.deg2rad(config.floor_rotation_deg), max(floor_translation, 1e-6)], 3)
     variances = bias**2 * config.horizon_keyframes + floor**2
-    covariance = config.covariance_inflation * node.covariance + np.diag(variances)
-    return np.asarray(0.5 * (covariance + covariance.T))
+    return _symmetric(config.covariance_inflation * node.covariance + np.diag(variances))
 
 
 def adjoint_stack(T: NDArray[np.floating]) -> Matrix:
@@ -176,3 +183,7 @@ def adjoint_stack(T: NDArray[np.floating]) -> Matrix:
     out[:, 3:, :3] = hat @ R
     out[:, 3:, 3:] = scaled
     return out
+
+
+def _symmetric(covariance: Matrix) -> Matrix:
+    return np.asarray(0.5 * (covariance + covariance.T))

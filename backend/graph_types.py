@@ -14,11 +14,26 @@ Key = tuple[int, int]  # query and match, which name a loop
 
 
 @dataclass(frozen=True, eq=False)
+class Span:
+    """What a motion is made of where the keyframes on its way have gone.
+
+    ``steps`` motions, which turned by ``angle`` and went ``length`` in all; ``drift`` (6, 6) is the covariance that
+    they have beyond the odometry's own, in the later keyframe's frame, rotation first.
+    """
+
+    steps: int
+    angle: float
+    length: float
+    drift: Matrix
+
+
+@dataclass(frozen=True, eq=False)
 class Node:
     """A keyframe as the graph sees it.
 
     ``T_odom_cam`` (4, 4) is its odometry pose, ``covariance`` (6, 6) that of the motion since the previous keyframe.
-    ``previous_id`` None starts a session. ``metric`` False: the session's scale is arbitrary and may drift.
+    ``previous_id`` None starts a session. ``metric`` False: the session's scale is arbitrary and may drift. ``span``
+    None: no keyframe between it and the previous one has gone.
     """
 
     id: int
@@ -27,6 +42,7 @@ class Node:
     T_odom_cam: Matrix
     covariance: Matrix
     metric: bool = True
+    span: Span | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +90,9 @@ class Solver(Protocol):
 
     def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
         """Take in a graph that was solved before, with the poses of all nodes, and solve nothing."""
+
+    def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+        """Take in another graph, as ``restore`` does, in place of all that was told before."""
 
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop; it acts at the next ``optimise``."""

@@ -134,6 +134,7 @@ class SimilarityVariables(PoseVariables):
     def odometry(self, previous_id: int, node: Node, motion: Matrix) -> gtsam.NonlinearFactor:
         """Join a keyframe with its predecessor; the scale may drift where the session is not metric."""
         scale_sigma = 1e-4 if node.metric else self._drift.scale_per_keyframe
+        scale_sigma *= 1.0 if node.span is None else node.span.steps**0.5
         noise = _with_scale(white_covariance(node, motion, self._drift), scale_sigma)
         return gtsam.BetweenFactorSimilarity3(previous_id, node.id, self.value(motion), noise)
 

@@ -12,6 +12,7 @@ from seamark.backend.map_codec import (
     decode_camera,
     decode_features,
     decode_loop,
+    decode_span,
     row_name,
 )
 from seamark.backend.map_file import MapFile
@@ -73,13 +74,15 @@ def _decode(table: str, row: sqlite3.Row) -> None:
         lengths = {len(features.points), len(features.scales), len(features.angles), len(features.descriptors)}
         if len(lengths) != 1:
             raise ValueError(f"features of different lengths {sorted(lengths)}")
+    elif table == "spans":
+        decode_span(row)
     elif table == "loops":
         decode_loop(row)
     elif table == "cameras":
         decode_camera(row["model"])
     elif table == "images":
         decode_array(row["thumbnail"])
-    elif table in ("edges", "keyframes", "landmarks", "poses"):
+    elif table in ("edges", "keyframes", "landmarks", "poses", "views"):
         names = (name for name in row.keys() if name not in ("checksum", "file"))  # noqa: SIM118 (no mapping)
         for value in (row[name] for name in names):
             decode_array(value if isinstance(value, bytes) else None)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.errors import MapCorruptError
+from seamark.backend.graph_types import Span
 from seamark.backend.types import Loop, Reason
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
@@ -48,7 +49,7 @@ def decode_array(blob: bytes | None) -> NDArray[Any] | None:
 
 
 def encode_keyframe(keyframe: Keyframe, T_previous_odom: NDArray[np.float64] | None) -> dict[str, Values]:
-    """Return the rows of keyframes, edges, features, landmarks and images; the keyframe's camera_id is left None.
+    """Return the rows of a keyframe in the tables that have some; its camera_id is left None.
 
     ``T_previous_odom`` (4, 4) is the inverse of the previous keyframe's odometry pose.
     """
@@ -69,7 +70,17 @@ def encode_keyframe(keyframe: Keyframe, T_previous_odom: NDArray[np.float64] | N
         ),
         "landmarks": (number, encode_array(keyframe.landmarks)),
         "images": (number, keyframe.jpeg, encode_array(keyframe.thumbnail)),
+        "views": (number, encode_array(lighting_of(keyframe.thumbnail))),
     }
+
+
+def lighting_of(thumbnail: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return mean and standard deviation (6,) of the three colours of a thumbnail, in 0..1."""
+    if thumbnail.size == 0:
+        return np.zeros(6)
+    colours = thumbnail.reshape(-1, thumbnail.shape[2] if thumbnail.ndim == 3 else 1)[:, :3] / 255.0
+    colours = np.broadcast_to(colours, (len(colours), 3))
+    return np.concatenate([colours.mean(axis=0), colours.std(axis=0)])
 
 
 def encode_camera(camera: Camera) -> str:
@@ -170,11 +181,12 @@ def check_row(table: str, row: Sequence[Any] | sqlite3.Row) -> None:
 
 def row_name(table: str, values: Sequence[Any]) -> str:
     """Return what a row is called in messages."""
-    if table in ("loops", "evidence"):
-        return f"{'loop' if table == 'loops' else 'the evidence of loop'} {values[0]} to {values[1]}"
+    if table in ("loops", "evidence", "composed"):
+        what = {"loops": "loop", "evidence": "the evidence of loop", "composed": "what is composed to loop"}[table]
+        return f"{what} {values[0]} to {values[1]}"
     if table == "keyframes":
         return f"keyframe {values[0]}"
-    if table in ("edges", "features", "landmarks", "images", "poses"):
+    if table in ("edges", "features", "landmarks", "images", "poses", "views", "spans"):
         return f"row {table} of keyframe {values[0]}"
     return f"row {values[0]} of {table}"
 
@@ -186,3 +198,16 @@ def motion_between(T_odom_previous: NDArray[np.float64], T_odom_cam: NDArray[np.
 
 def _number(value: float | None) -> float:
     return float("nan") if value is None else value
+
+
+def encode_span(keyframe_id: int, span: Span) -> Values:
+    """Return the row of what a motion is made of."""
+    return (int(keyframe_id), int(span.steps), float(span.angle), float(span.length), encode_array(span.drift))
+
+
+def decode_span(row: Row) -> Span:
+    """Return the span of a row; raises MapCorruptError for one without a covariance."""
+    drift = decode_array(row["drift"])
+    if drift is None or drift.shape != (6, 6):
+        raise MapCorruptError(f"the span of keyframe {row['keyframe_id']} has no covariance")
+    return Span(row["steps"], row["angle"], row["length"], drift)

@@ -61,8 +61,9 @@ class KeyframeMemory:
         return whole
 
     def forget(self, keyframe_ids: Iterable[int]) -> None:
-        """Drop keyframes' features, which the map no longer has."""
+        """Drop the features of keyframes that the map no longer has, and do not look for them there."""
         with self._lock:
+            self._forgotten.clear()
             for number in keyframe_ids:
                 self._forgotten.add(number)
                 gone = self._kept.pop(number, None)

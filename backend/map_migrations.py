@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.errors import MapCorruptError
 from seamark.backend.map_codec import decode_array, encode_array, motion_between, sealed
-from seamark.backend.map_schema import TABLES, upsert
+from seamark.backend.map_schema import TABLES_OF_2, TABLES_OF_3, upsert
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ def _from_1_to_2(database: sqlite3.Connection) -> None:
     """Split the wide table of keyframes, and give sessions, cameras and the history of loops tables of their own."""
     for table in V1_COLUMNS:
         database.execute(f"ALTER TABLE {table} RENAME TO old_{table}")
-    for statement in TABLES:
+    for statement in TABLES_OF_2:
         database.execute(statement)
 
     def old(table: str) -> Iterator[dict[str, Any]]:
@@ -67,7 +67,7 @@ def _from_1_to_2(database: sqlite3.Connection) -> None:
 
 
 def convert_v1(old: Callable[[str], Iterable[dict[str, Any]]]) -> Rows:
-    """Yield today's rows (table, values), parents first, of the rows of a file of version 1 that ``old`` gives."""
+    """Yield rows of version 2 (table, values), parents first, of the rows of a file of version 1 that ``old`` gives."""
     components = {row["keyframe_id"]: row["component"] for row in old("poses")}
     revision = 0
     for row in old("meta"):
@@ -123,4 +123,12 @@ def checksum_v1(values: Sequence[Any]) -> int:
     return crc
 
 
-MIGRATIONS: Final = (_from_1_to_2,)
+def _from_2_to_3(database: sqlite3.Connection) -> None:
+    """Add tables for what is composed of forgotten keyframes, and one of the views that there are."""
+    for statement in TABLES_OF_3:
+        database.execute(statement)
+    ids = database.execute("SELECT keyframe_id FROM features ORDER BY 1").fetchall()
+    database.executemany(upsert("views"), [sealed("views", (number, None)) for (number,) in ids])
+
+
+MIGRATIONS: Final = (_from_1_to_2, _from_2_to_3)

@@ -1,7 +1,7 @@
 """Which views of a map can be forgotten, so that each place stays recognisable in each of its lightings."""
 
 import heapq
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.config import MapConfig
-from seamark.backend.map_store import IMAGES, MapStore
+from seamark.backend.map_store import MapStore
 
 Vector = NDArray[np.float64]
 KEEP_SHARE = 0.9  # of a budget, once it is exceeded: pruning shall be rare
@@ -37,32 +37,30 @@ class Pruning:
     wanted: int
 
 
-def lighting_of(thumbnail: NDArray[np.uint8]) -> Vector:
-    """Return mean and standard deviation (6,) of the three colours of a thumbnail, in 0..1."""
-    if thumbnail.size == 0:
-        return np.zeros(6)
-    colours = thumbnail.reshape(-1, thumbnail.shape[2] if thumbnail.ndim == 3 else 1)[:, :3] / 255.0
-    colours = np.broadcast_to(colours, (len(colours), 3))
-    return np.concatenate([colours.mean(axis=0), colours.std(axis=0)])
-
-
 def views_of(store: MapStore) -> list[View]:
-    """Return the views of a map that can be recognised, by ascending id; images are read one by one."""
+    """Return the views of a map that can be recognised, by ascending id; no images are read."""
     poses, sessions, views = store.load_poses(), store.session_of_keyframes(), []
-    for number in store.keyframe_ids(recognisable=True):
+    for number, lighting in sorted(store.load_lightings().items()):
         T, component, _ = poses.get(number, (None, sessions[number], 1.0))
-        lighting = lighting_of(store.keyframe(number, (IMAGES,)).thumbnail)
         position, direction = (None, None) if T is None else (T[:3, 3], T[:3, 2])
         views.append(View(number, component, position, direction, lighting))
     return views
 
 
-def choose(views: list[View], keep: int, joined: Iterable[tuple[int, int]], config: MapConfig) -> Pruning:
+def choose(
+    views: list[View],
+    keep: int,
+    joined: Iterable[tuple[int, int]],
+    config: MapConfig,
+    spared: Collection[int] = (),
+    most: int | None = None,
+) -> Pruning:
     """Choose views to forget until ``keep`` are left, the most redundant first and of these the oldest.
 
     Two views stand for one another when they are near, look the same way and in the same lighting; without poses,
     when an accepted loop joins them (``joined``). A view is forgotten only while another that stays stands for it, and
-    for all that were forgotten in its favour: so every place keeps a view of each lighting, whatever the budget.
+    for all that were forgotten in its favour: so every place keeps a view of each lighting, whatever the budget. Views
+    in ``spared`` stay. At most ``most`` are forgotten at once.
     """
     alike = _alike(views, joined, config)
     alive = {view.id for view in views}
@@ -70,9 +68,9 @@ def choose(views: list[View], keep: int, joined: Iterable[tuple[int, int]], conf
     queue = [(-count, number) for number, count in stands_for.items()]
     heapq.heapify(queue)
     forgotten: list[int] = []
-    while queue and len(alive) > keep:
+    while queue and len(alive) > keep and (most is None or len(forgotten) < most):
         count, number = heapq.heappop(queue)
-        if number not in alive or -count != stands_for[number]:
+        if number not in alive or -count != stands_for[number] or number in spared:
             continue  # an entry from before
         if stands_for[number] < 1 or any(other not in alive and stands_for[other] < 2 for other in alike[number]):
             continue  # the last that stands for itself or for one that is gone

@@ -2,7 +2,7 @@
 
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,8 @@ from seamark.backend.map_migrations import V1_COLUMNS, checksum_v1, convert_v1
 from seamark.backend.map_schema import COLUMNS, KEYS, select, upsert
 
 BATCH: Final = 200
-OF_KEYFRAME: Final = ("edges", "features", "landmarks", "images", "poses")
+OF_VERSION_3: Final = ("views", "spans", "composed")
+OF_KEYFRAME: Final = ("edges", "features", "landmarks", "images", "poses", "views", "spans")
 
 
 @dataclass
@@ -72,7 +73,8 @@ def _save(path: Path, file: MapFile, report: RepairReport) -> None:
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as old:
             version = old.execute("PRAGMA user_version").fetchone()[0]
-            rows = _rows_of_v1(old, report) if version == 1 else _rows_by_tables(old, report, stumbled)
+            missing = OF_VERSION_3 if version == 2 else ()
+            rows = _rows_of_v1(old, report) if version == 1 else _rows_by_tables(old, report, stumbled, missing)
             _write(file, rows)
             if version == 1:
                 return
@@ -85,9 +87,9 @@ def _save(path: Path, file: MapFile, report: RepairReport) -> None:
 
 
 def _rows_by_tables(
-    old: sqlite3.Connection, report: RepairReport, stumbled: set[str]
+    old: sqlite3.Connection, report: RepairReport, stumbled: set[str], missing: Collection[str]
 ) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    for table in COLUMNS:
+    for table in (name for name in COLUMNS if name not in missing):
         forward, seen = select(table), set()
         backward = forward.replace(f" ORDER BY {', '.join(KEYS[table])}", "") + " ORDER BY rowid DESC"
         for query in (forward, backward):
@@ -152,13 +154,14 @@ def _mend(database: sqlite3.Connection, report: RepairReport) -> None:
         report.lost.append(f"{len(lost)} keyframes: {_listed(lost)}")
     for table in OF_KEYFRAME:
         database.execute(f"DELETE FROM {table} WHERE keyframe_id NOT IN (SELECT id FROM keyframes)")
-    database.execute("DELETE FROM landmarks WHERE keyframe_id NOT IN (SELECT keyframe_id FROM features)")
+    for table in ("landmarks", "views"):
+        database.execute(f"DELETE FROM {table} WHERE keyframe_id NOT IN (SELECT keyframe_id FROM features)")
     dangling = "query_id NOT IN (SELECT id FROM keyframes) OR match_id NOT IN (SELECT id FROM keyframes)"
     gone = database.execute(f"SELECT query_id, match_id FROM loops WHERE {dangling}").fetchall()
     if gone:
         report.lost.append(f"{len(gone)} loops: {_listed([f'{row[0]} to {row[1]}' for row in gone])}")
     database.execute(f"DELETE FROM loops WHERE {dangling}")
-    for table in ("evidence", "history"):
+    for table in ("evidence", "history", "composed"):
         count = database.execute(
             f"DELETE FROM {table} WHERE (query_id, match_id) NOT IN (SELECT query_id, match_id FROM loops)"
         ).rowcount
@@ -167,6 +170,10 @@ def _mend(database: sqlite3.Connection, report: RepairReport) -> None:
     _mend_sessions(database, keyframes, report)
     _mend_cameras(database, keyframes, report)
     _mend_edges(database, keyframes, report)
+    database.execute("DELETE FROM spans WHERE keyframe_id NOT IN (SELECT keyframe_id FROM edges)")
+    untold = "SELECT keyframe_id FROM features WHERE keyframe_id NOT IN (SELECT keyframe_id FROM views)"
+    for (number,) in database.execute(untold).fetchall():  # light is read from the image when it is asked for
+        database.execute(upsert("views"), sealed("views", (number, None)))
     for table in ("features", "landmarks", "images"):
         found = {row[0] for row in database.execute(f"SELECT keyframe_id FROM {table}")}
         missing = sorted(set(keyframes) - found)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Final
 
 APPLICATION_ID: Final = 0x5EA3A12C
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 
 #: Columns of each table but the last, ``checksum``: the CRC-32 of the table's name and the row's other values. Parents
 #: come before what refers to them.
@@ -24,16 +24,20 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "evidence": ("query_id", "match_id", "content"),
     "history": ("id", "query_id", "match_id", "accepted", "reason", "newest_keyframe_id", "revision"),
+    "views": ("keyframe_id", "lighting"),
+    "spans": ("keyframe_id", "steps", "angle", "length", "drift"),
+    "composed": ("query_id", "match_id", "count", "scale_sigma"),
 }
 #: What names a row; all other columns are replaced when it is written again.
 KEYS: Final[dict[str, tuple[str, ...]]] = {
     **{table: (columns[0],) for table, columns in COLUMNS.items()},
     "loops": ("query_id", "match_id"),
     "evidence": ("query_id", "match_id"),
+    "composed": ("query_id", "match_id"),
 }
 
 # Rows are small where they are read at start (keyframes, edges, poses) and large where they are read one by one.
-TABLES: Final = (
+TABLES_OF_2: Final = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL)",
     """CREATE TABLE sessions (
         id INTEGER PRIMARY KEY, first_keyframe_id INTEGER NOT NULL, stamp_ns INTEGER NOT NULL,
@@ -79,6 +83,19 @@ TABLES: Final = (
     "CREATE INDEX loops_to ON loops (match_id)",
     "CREATE INDEX history_of_loop ON history (query_id, match_id)",
 )
+TABLES_OF_3: Final = (
+    """CREATE TABLE views (
+        keyframe_id INTEGER PRIMARY KEY REFERENCES features (keyframe_id) ON DELETE CASCADE, lighting BLOB,
+        checksum INTEGER NOT NULL)""",
+    """CREATE TABLE spans (
+        keyframe_id INTEGER PRIMARY KEY REFERENCES edges (keyframe_id) ON DELETE CASCADE, steps INTEGER NOT NULL,
+        angle REAL NOT NULL, length REAL NOT NULL, drift BLOB NOT NULL, checksum INTEGER NOT NULL)""",
+    """CREATE TABLE composed (
+        query_id INTEGER NOT NULL, match_id INTEGER NOT NULL, count INTEGER NOT NULL, scale_sigma REAL NOT NULL,
+        checksum INTEGER NOT NULL, PRIMARY KEY (query_id, match_id),
+        FOREIGN KEY (query_id, match_id) REFERENCES loops (query_id, match_id) ON DELETE CASCADE)""",
+)
+TABLES: Final = TABLES_OF_2 + TABLES_OF_3
 
 
 def upsert(table: str) -> str:

@@ -1,9 +1,12 @@
 """The map as the back end knows it between two optimisations."""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.graph_types import Estimate
+from seamark.backend.graph_types import Estimate, Node
 from seamark.backend.types import Loop, MapSnapshot
 from seamark.frontend import se3
 from seamark.frontend.types import Keyframe
@@ -71,6 +74,27 @@ class MapState:
                 self._components[session] = int(estimate.components[row])
         for keyframe_id in since:
             self._hang(self.keyframes[keyframe_id], self._previous[keyframe_id])
+
+    def components(self) -> dict[int, int]:
+        """Return for each session the one in whose frame of reference its poses are."""
+        return dict(self._components)
+
+    def contract(self, nodes: Iterable[Node], components: Mapping[int, int]) -> None:
+        """Keep these keyframes only, each hanging on its node's predecessor, at the poses that they have."""
+        kept = {node.id: node for node in nodes}
+        self.keyframes = {
+            number: replace(keyframe, previous_id=kept[number].previous_id)
+            for number, keyframe in self.keyframes.items()
+            if number in kept
+        }
+        self._poses = {number: pose for number, pose in self._poses.items() if number in kept}
+        self._scales = {number: scale for number, scale in self._scales.items() if number in kept}
+        self._components = dict(components)
+        self._previous = {number: self.keyframes[number].previous_id for number in self.keyframes}
+        self._first, self._last = {}, {}
+        for number, keyframe in self.keyframes.items():
+            self._first.setdefault(keyframe.session, number)
+            self._last[keyframe.session] = number
 
     def estimate(self) -> Estimate:
         """Return all poses as a solver would give them."""

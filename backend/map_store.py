@@ -11,18 +11,22 @@ from numpy.typing import NDArray
 
 from seamark.backend.errors import MapCorruptError, MapError
 from seamark.backend.evidence import Evidence, decode_evidence, encode_evidence
+from seamark.backend.graph_types import Span
 from seamark.backend.map_codec import (
     check_row,
     decode_array,
     decode_camera,
     decode_keyframe,
     decode_loop,
+    decode_span,
     encode_array,
     encode_camera,
     encode_keyframe,
     encode_loop,
+    lighting_of,
     sealed,
 )
+from seamark.backend.map_contraction import Contracted, Mean, write_means, write_nodes
 from seamark.backend.map_file import MapFile
 from seamark.backend.map_schema import select, upsert
 from seamark.backend.types import Loop, MapSnapshot, Reason
@@ -31,7 +35,6 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.types import Keyframe
 
 FEATURES, IMAGES = "features", "images"
-BLOB_TABLES = ("images", "landmarks", "features")  # children first
 POSE_TOLERANCE = 1e-9
 
 
@@ -158,20 +161,18 @@ class MapStore:
         with self.file.writing() as database:
             database.executemany(upsert("landmarks"), [sealed("landmarks", row) for row in rows])
 
-    def forget(self, keyframe_ids: Iterable[int]) -> None:
-        """Delete features, landmarks and images of keyframes, and the evidence of the loops that they asked for.
-
-        Poses, edges and loops stay.
-        """
-        ids = [(int(number),) for number in keyframe_ids]
+    def contract(self, change: Contracted) -> None:
+        """Forget keyframes and all that belongs to them; what they said lives on in edges and loops, as one change."""
         with self.file.writing() as database:
-            for table in BLOB_TABLES:
-                database.executemany(f"DELETE FROM {table} WHERE keyframe_id = ?", ids)
-            database.executemany("DELETE FROM evidence WHERE query_id = ?", ids)
+            write_nodes(database, change)
+            self._write_loops(database, change.loops)
+            write_means(database, change.means())
+        for number in change.graph.gone:
+            self._written.pop(number, None)
 
     def keyframe_ids(self, recognisable: bool = False) -> list[int]:
         """Return the ids of all keyframes, or of those that have features, ascending."""
-        table, column = ("features", "keyframe_id") if recognisable else ("keyframes", "id")
+        table, column = ("views", "keyframe_id") if recognisable else ("keyframes", "id")
         with self.file.reading() as database:
             return [row[0] for row in database.execute(f"SELECT {column} FROM {table} ORDER BY 1")]
 
@@ -219,6 +220,31 @@ class MapStore:
             )
             for row in self._rows("poses")
         }
+
+    def load_spans(self) -> dict[int, Span]:
+        """Return what the motions are made of on whose way keyframes have gone."""
+        return {row["keyframe_id"]: decode_span(row) for row in self._rows("spans")}
+
+    def load_means(self) -> dict[tuple[int, int], Mean]:
+        """Return what is known of composed loops beside their rows."""
+        return {
+            (row["query_id"], row["match_id"]): Mean(row["count"], row["scale_sigma"]) for row in self._rows("composed")
+        }
+
+    def load_lightings(self) -> dict[int, NDArray[np.float64]]:
+        """Return mean and spread of the colours (6,) of all keyframes that can be recognised.
+
+        Only those of files of earlier versions are read from the images, once.
+        """
+        found = {row["keyframe_id"]: decode_array(row["lighting"]) for row in self._rows("views")}
+        missing = [number for number, lighting in found.items() if lighting is None]
+        for number in missing:
+            found[number] = lighting_of(self.keyframe(number, (IMAGES,)).thumbnail)
+        if missing and not self.file.read_only:
+            with self.file.writing() as database:
+                rows = [sealed("views", (number, encode_array(found[number]))) for number in missing]
+                database.executemany(upsert("views"), rows)
+        return {number: lighting for number, lighting in found.items() if lighting is not None}
 
     def session_of_keyframes(self) -> dict[int, int]:
         """Return the session of each keyframe."""

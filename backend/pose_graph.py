@@ -32,6 +32,12 @@ class PoseGraph:
     def __init__(self, config: BackendConfig, planar: bool = False) -> None:
         self._config: GraphConfig = config.graph
         self._drift: DriftConfig = config.drift
+        self._kind = PlanarVariables if planar else PoseVariables
+        self._revision = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        """Begin without keyframes."""
         self._nodes: list[Node] = []
         self._rows: dict[int, int] = {}
         self._before: list[int] = []  # row of the predecessor, -1 where a session starts
@@ -40,13 +46,11 @@ class PoseGraph:
         self._poses = np.tile(np.eye(4), (_FIRST_ROWS, 1, 1))  # [sR t; 0 1] from keyframe to map
         self._loops: dict[Key, Constraint] = {}
         self._frames: dict[int, int] = {}  # session -> session in whose frame its poses are
-        kind = PlanarVariables if planar else PoseVariables
-        self._variables: PoseVariables = kind(self._config, self._drift)
+        self._variables: PoseVariables = self._kind(self._config, self._drift)
         self._isam: gtsam.ISAM2 | None = None
         self._solved_rows = 0  # those that iSAM2 knows
         self._new_loops: list[Key] = []
         self._requested = False
-        self._revision = 0
 
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed or was given before."""
@@ -84,6 +88,11 @@ class PoseGraph:
         for constraint in constraints:
             self.add_loop(constraint)
         self._revision = estimate.revision
+
+    def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+        """Take in another graph, as ``restore`` does, in place of all that was told before."""
+        self._clear()
+        self.restore(nodes, constraints, estimate)
 
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop, replacing one of the same pair; it acts at the next ``optimise``."""

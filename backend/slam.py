@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,13 +10,15 @@ import numpy as np
 from seamark.backend.chain import OdometryChains
 from seamark.backend.config import BackendConfig
 from seamark.backend.consistency import gate_chi2
+from seamark.backend.contraction import contract
 from seamark.backend.errors import BackendInputError
 from seamark.backend.evidence import Evidence, Gate
-from seamark.backend.graph_types import Constraint, Estimate, Node, Solver, check_node
+from seamark.backend.graph_types import Constraint, Estimate, Node, Solver, Span, check_node
 from seamark.backend.judge import PoseJudge
 from seamark.backend.judge_places import PlaceJudge
 from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
 from seamark.backend.likelihood import probability
+from seamark.backend.map_contraction import Contracted, Mean, contracted
 from seamark.backend.map_memory import KeyframeMemory, Load
 from seamark.backend.map_state import MapState, StoredPose
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
@@ -55,14 +57,12 @@ class Slam:
             raise BackendInputError(f"mode {mode} needs {'no' if mode == Mode.PLACES else 'a'} solver")
         self._config, self._solver, self._seed = config, solver, seed
         self._chains = OdometryChains(config.drift)
-        judge: Judge = PlaceJudge(config.places, config.consistency)
-        if solver is not None:
-            judge = PoseJudge(self._chains, config.consistency)
-        self._ledger = LoopLedger(judge)
+        self._ledger = LoopLedger(self._judge())
         self._map = MapState()
         self._unsolved = False
         self._memory = KeyframeMemory(config.map.memory_mb << 20, load)
         self._loops: dict[Key, Loop] = {}
+        self._means: dict[Key, Mean] = {}  # of composed loops
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
         self._evidence: dict[Key, Evidence | None] = {}  # of the last step; all of it would be memory without bound
         self._lock = threading.Lock()
@@ -120,18 +120,24 @@ class Slam:
         loops: Iterable[Loop],
         poses: Mapping[int, StoredPose] | None = None,
         revision: int = 0,
+        spans: Mapping[int, Span] | None = None,
+        means: Mapping[Key, Mean] | None = None,
     ) -> None:
         """Take in what a map on disk holds (keyframes in order of id, features or not), accepted loops unasked.
 
-        With ``poses``, those of the map at ``revision``, nothing is solved; without, all is.
+        With ``poses``, those of the map at ``revision``, nothing is solved; without, all is. ``spans`` and ``means``
+        are what the map has of keyframes that have gone.
         """
-        nodes = [self._hold(keyframe, (poses or {}).get(keyframe.id)) for keyframe in keyframes]
+        poses, spans = poses or {}, spans or {}
+        self._means = dict(means or {})
+        nodes = [self._hold(keyframe, poses.get(keyframe.id), spans.get(keyframe.id)) for keyframe in keyframes]
         accepted: dict[Key, Constraint | None] = {}
         for loop in loops:
             with self._lock:
                 self._loops[loop.query_id, loop.match_id] = loop
             if loop.accepted and (self._solver is None or loop.T_match_query is not None):
-                finding = self._finding_of(loop)
+                mean = self._means.get((loop.query_id, loop.match_id))
+                finding = self._finding_of(loop, None if mean is None else mean.scale_sigma)
                 self._ledger.restore(finding)
                 accepted[finding.key] = finding.constraint
         if poses and self._solver is not None:
@@ -147,9 +153,44 @@ class Slam:
         if self._commit(list(accepted)) and self._solver is not None:
             self._take(self._solver.optimise())
 
-    def forget(self, keyframe_ids: Iterable[int]) -> None:
-        """Drop the features of keyframes: they are not recognised any more, their poses stay."""
-        self._memory.forget(keyframe_ids)
+    def without(self, keyframe_ids: Collection[int]) -> Contracted:
+        """Say what the map is without these keyframes; it becomes that when it is told to ``adopt`` it."""
+        nodes = self._chains.nodes()
+        if self._solver is None:
+            keyframes = self._map.keyframes.values()
+            nothing = np.zeros((6, 6))
+            nodes = tuple(Node(one.id, one.session, one.previous_id, np.eye(4), nothing) for one in keyframes)
+        found = (self._ledger.finding(key).constraint for key in sorted(self._committed))
+        constraints = [constraint for constraint in found if constraint is not None]
+        counts = {key: mean.count for key, mean in self._means.items()}
+        graph = contract(nodes, constraints, keyframe_ids, self._config.drift, counts)
+        return contracted(graph, self._loops, self._map.components())
+
+    def adopt(self, change: Contracted) -> None:
+        """Be the map that ``without`` has said; poses stay what they are until the next solution."""
+        composed = {(loop.query_id, loop.match_id): loop for loop in change.loops}
+        with self._lock:
+            self._loops = {key: loop for key, loop in self._loops.items() if change.stays(key)} | composed
+            self._map.contract(change.graph.nodes, change.components)
+        self._memory.forget(change.graph.gone)
+        self._means = {key: mean for key, mean in self._means.items() if change.stays(key)} | change.means()
+        self._chains = OdometryChains(self._config.drift)
+        self._ledger = LoopLedger(self._judge())
+        if self._solver is not None:
+            self._chains.extend(change.graph.nodes)
+            self._solver.exchange(change.graph.nodes, list(change.graph.loops.values()), self._map.estimate())
+        self._committed = {key for key in self._committed if change.stays(key)} | set(composed)
+        for key in sorted(self._committed):
+            finding = self._finding_of(self._loops[key])
+            if key in change.graph.loops:
+                finding = replace(finding, constraint=change.graph.loops[key])
+            self._ledger.restore(finding)
+        self._unsolved = bool(change.graph.loops)
+
+    def _judge(self) -> Judge:
+        if self._solver is None:
+            return PlaceJudge(self._config.places, self._config.consistency)
+        return PoseJudge(self._chains, self._config.consistency)
 
     def locate(self, query: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
         """Say where one image was taken: the verified candidates, localised ones first, then by inliers.
@@ -172,7 +213,7 @@ class Slam:
         if self._solver is not None and node is not None:
             self._solver.add_keyframe(node)
 
-    def _hold(self, keyframe: Keyframe, pose: StoredPose | None = None) -> Node | None:
+    def _hold(self, keyframe: Keyframe, pose: StoredPose | None = None, span: Span | None = None) -> Node | None:
         """Take the keyframe into memory; return what the graph is to know of it."""
         node = None
         if keyframe.id in self._map.keyframes:
@@ -188,6 +229,7 @@ class Slam:
                 keyframe.T_odom_cam,
                 covariance,
                 keyframe.metric,
+                span,
             )
             check_node(node)
             self._chains.add(node)

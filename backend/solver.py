@@ -46,6 +46,7 @@ class SolverProcess:
         self._connection: Connection | None = None
         self._asked_at: float | None = None  # when the question was put that is still unanswered
         self._wanted = False  # another solution, once this one is there
+        self._outdated = False  # the one that is being made is of a graph that was exchanged since
         self._failures = 0
         self._revision = 0
         self.restarts = 0
@@ -71,6 +72,14 @@ class SolverProcess:
         self._loops |= {constraint.key for constraint in constraints}
         self._told.append(("restore", (nodes, constraints, estimate)))
         self._revision = estimate.revision
+
+    def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+        """Take in another graph, as ``restore`` does, in place of all that was told before."""
+        self._told, self._sent = [("exchange", (nodes, constraints, estimate))], 0
+        self._keyframes = {node.id for node in nodes}
+        self._loops = {constraint.key for constraint in constraints}
+        self._revision = estimate.revision
+        self._outdated = self._asked_at is not None
 
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop; it acts at the next solution."""
@@ -109,10 +118,11 @@ class SolverProcess:
             return None
         if answer is None:
             return None
-        if self._wanted:
+        outdated, self._outdated = self._outdated, False
+        if self._wanted or outdated:
             self._wanted = False
             self.request()
-        return self._numbered(_value(answer))
+        return None if outdated else self._numbered(_value(answer))
 
     def optimise(self, thorough: bool = False) -> Estimate:
         """Return the poses with all loops so far; revisions go on counting when the child is started again."""
@@ -137,7 +147,7 @@ class SolverProcess:
                 self._process.join()
             self._process.close()
         self._connection = self._process = self._asked_at = None
-        self._sent = 0
+        self._sent, self._outdated = 0, False
 
     def _numbered(self, value: object) -> Estimate:
         self._revision += 1
@@ -149,7 +159,7 @@ class SolverProcess:
             try:
                 if self._asked_at is not None:
                     self._answer(self._reply_timeout_s)  # an earlier solution, which this question outdates
-                self._wanted = False
+                self._wanted = self._outdated = False
                 self._put(verb, arguments)
                 answer = self._answer(self._reply_timeout_s)
                 assert answer is not None

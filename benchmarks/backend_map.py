@@ -17,18 +17,23 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import psutil
 
 from seamark.backend.config import BackendConfig, MapConfig, VerificationConfig
-from seamark.backend.map_prune import KEEP_SHARE, budget, choose, views_of
-from seamark.backend.map_store import FEATURES, MapStore
+from seamark.backend.map_open import loader, restore
+from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam
 from seamark.backend.solver import SolverProcess
 from seamark.backend.types import MapSnapshot
 from seamark.frontend.camera import Camera
 from seamark.frontend.types import Features, Keyframe, Mode
+from seamark.service.nodes.map_keeper import MapKeeper
+from seamark.service.nodes.map_pruner import MapPruner
+from seamark.service.nodes.meter import Meter
 from seamark.vocab.config import VocabConfig
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import Candidates, PlaceObservation
@@ -130,8 +135,8 @@ def open_as_the_back_end(path: Path, count: int) -> dict[str, float]:
     """Return how long it takes until a place query could be verified."""
     started, cpu = time.perf_counter(), time.process_time()
     store, solver = MapStore(path), SolverProcess(BackendConfig())
-    slam = Slam(BackendConfig(), Mode.RGBD, solver, 0, lambda number: store.keyframe(number, (FEATURES,)))
-    slam.restore(store.load_nodes(), store.load_loops(), store.load_poses(), int(store.meta()["revision"]))
+    slam = Slam(BackendConfig(), Mode.RGBD, solver, 0, loader(store))
+    restore(slam, store)
     wall_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu
     assert len(slam.snapshot().keyframe_ids) == count
     solver.close()
@@ -139,7 +144,7 @@ def open_as_the_back_end(path: Path, count: int) -> dict[str, float]:
     return {"wall_s": round(wall_s, 2), "cpu_s": round(cpu_s, 2)}
 
 
-def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, object]]:
+def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, Any]]:
     """Drive the same loop again and again with room for ``keep`` views; one row per tenth lap."""
     path, rows = folder / "map.seamark", []
     limits = MapConfig(keyframes=keep, memory_mb=4)
@@ -148,7 +153,11 @@ def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, ob
     index = PlaceIndex(vocabulary, VocabConfig(exclude_recent_s=20.0))
     solver = SolverProcess(config)
     with MapStore(path) as store:
-        slam = Slam(config, Mode.RGBD, solver, 0, lambda number: store.keyframe(number, (FEATURES,)))
+        slam = Slam(config, Mode.RGBD, solver, 0, loader(store))
+        meter = Meter("backend")
+        pruner = MapPruner(
+            MapKeeper(store, meter), slam, limits, meter, lambda gone: [index.remove(number) for number in gone]
+        )
         for lap in range(count):
             found, query_ms, step_ms = 0, [], []
             for step in range(per_lap):
@@ -166,19 +175,16 @@ def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, ob
                 snapshot = slam.snapshot() if result.optimised else None
                 store.record(result.loops, snapshot, {"mapped": str(one.id)})
                 found += any(loop.accepted and loop.match_id % per_lap == step for loop in result.loops)
-                if one.id % 20 == 0 and budget(store, config.map) is not None:
-                    store.update_poses(slam.snapshot())
-                    wanted = budget(store, config.map, KEEP_SHARE) or keep
-                    pruning = choose(views_of(store), wanted, (), config.map)
-                    store.forget(pruning.forget)
-                    slam.forget(pruning.forget)
-                    for number in pruning.forget:
-                        index.remove(number)
+                pruner.mapped(one.id)
             if lap in (1, 4) or lap % 10 == 9:
                 row = {
                     "lap": lap + 1,
                     "keyframes": (lap + 1) * per_lap,
                     "views": len(store.keyframe_ids(recognisable=True)),
+                    "nodes": len(slam.snapshot().keyframe_ids),
+                    "loops": sum(loop.accepted for loop in slam.snapshot().loops),
+                    "prune_ms": percentiles(meter.status().stages_ms.get("prune", [0.0])),
+                    "error_m": error_m(slam.snapshot(), per_lap),
                     "recall": round(found / per_lap, 3),
                     "query_ms": percentiles(query_ms),
                     "step_ms": percentiles(step_ms),
@@ -191,6 +197,35 @@ def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, ob
     return rows
 
 
+def error_m(snapshot: MapSnapshot, per_lap: int) -> float:
+    """Return the RMS error of the kept keyframes' positions after rigid alignment with where they were."""
+    true = np.stack([pose(number, per_lap)[:3, 3] for number in snapshot.keyframe_ids.tolist()])
+    found = snapshot.T_map_cam[:, :3, 3]
+    a, b = true - true.mean(axis=0), found - found.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    turn = (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T
+    return round(float(np.sqrt(((b @ turn.T - a) ** 2).sum(axis=1).mean())), 4)
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw each figure over the laps, from zero to its largest value."""
+    names = ("rss_mb", "disk_mb", "query_ms", "recall", "nodes", "loops")
+    picture = np.full((420, 640, 3), 255, np.uint8)
+    for k, name in enumerate(names):
+        values = [row[name]["p50"] if isinstance(row[name], dict) else row[name] for row in rows]
+        left, bottom = 30 + 205 * (k % 3), 180 + 205 * (k // 3)
+        most = max([*values, 1e-9])
+        points = [
+            (left + 170 * row["lap"] / rows[-1]["lap"], bottom - 130 * v / most)
+            for row, v in zip(rows, values, strict=True)
+        ]
+        cv2.rectangle(picture, (left, bottom - 140), (left + 175, bottom), (180, 180, 180))
+        cv2.polylines(picture, [np.array(points).astype(np.int32)], False, (160, 60, 0), 2, cv2.LINE_AA)
+        words = f"{name} {values[0]:.4g} .. {values[-1]:.4g}"
+        cv2.putText(picture, words, (left, bottom - 148), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.imwrite(str(path), picture)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("commit", "recover", "laps"))
@@ -199,6 +234,7 @@ def main() -> None:
     parser.add_argument("--per-lap", type=int, default=25)
     parser.add_argument("--keep", type=int, default=60)
     parser.add_argument("--folder", type=Path, help="Where maps are made; default: the folder for temporary files.")
+    parser.add_argument("--plot", type=Path, help="PNG to draw the laps to.")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         if options.what == "commit":
@@ -206,7 +242,9 @@ def main() -> None:
         elif options.what == "recover":
             print(json.dumps(recover(Path(folder), options.keyframes)))
         else:
-            laps(Path(folder), options.laps, options.per_lap, options.keep)
+            rows = laps(Path(folder), options.laps, options.per_lap, options.keep)
+            if options.plot is not None:
+                plot(rows, options.plot)
 
 
 if __name__ == "__main__":

@@ -101,16 +101,10 @@ def prune_command(
     """Forget redundant views of a map that no service is writing; each place keeps one of each lighting."""
     import os
 
-    from seamark.backend.map_prune import choose, views_of
-    from seamark.backend.map_store import MapStore
+    from seamark.backend.map_pruning import prune_map
     from seamark.service.config import load_config
 
-    config = load_config(None, os.environ, override or []).backend.map
-    with MapStore(map_file) as store:
-        joined = [(loop.query_id, loop.match_id) for loop in store.load_loops() if loop.accepted]
-        pruning = choose(views_of(store), keyframes, joined, config)
-        store.forget(pruning.forget)
-        store.compact()
+    pruning = prune_map(map_file, keyframes, load_config(None, os.environ, override or []).backend)
     if as_json:
         print_json({"forgotten": len(pruning.forget), "kept": pruning.kept, "wanted": pruning.wanted})
     else:

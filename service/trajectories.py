@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.types import MapSnapshot
+from seamark.frontend import se3
 from seamark.frontend.types import Matrix, Odometry
 from seamark.service.evaluation import Similarity
 from seamark.service.types import RunRecord, Trajectory
@@ -37,9 +38,29 @@ def references(snapshot: MapSnapshot) -> dict[int, Reference]:
     }
 
 
+def all_references(record: RunRecord) -> dict[int, Reference]:
+    """Return the references of a run; those that the map has forgotten hang on the last one kept of their session.
+
+    Odometry poses are of the whole session, so that this costs no more than the drift between the two.
+    """
+    known = references(record.snapshot)
+    last: dict[int, tuple[Reference, Matrix]] = {}
+    for frame in sorted((one for one in record.odometry if one.keyframe_id is not None), key=lambda one: one.stamp_ns):
+        number, T_odom_cam = frame.keyframe_id, frame.T_odom_cam
+        if number is None or T_odom_cam is None:
+            continue
+        if number in known:
+            last[frame.session] = known[number], T_odom_cam
+        elif frame.session in last:
+            reference, T_odom_reference = last[frame.session]
+            pose = reference.pose(se3.inverse(T_odom_reference) @ T_odom_cam)
+            known[number] = Reference(pose, reference.component, reference.scale)
+    return known
+
+
 def main_component(record: RunRecord) -> int | None:
     """Return the component with most frames of the input that have a pose; of equals the lowest. None without any."""
-    known = references(record.snapshot)
+    known = all_references(record)
     counts: dict[int, int] = {}
     for reference_id, *_ in _frames(record.odometry):
         if reference_id in known:
@@ -59,7 +80,7 @@ def main_session(odometry: tuple[Odometry, ...]) -> int | None:
 
 def corrected(record: RunRecord) -> Trajectory:
     """Return T_map_cam of every frame of the main component, ordered by stamp; frames without a pose are not in it."""
-    known, component = references(record.snapshot), main_component(record)
+    known, component = all_references(record), main_component(record)
     poses: dict[int, tuple[int, Matrix]] = {}
     for reference_id, index, stamp_ns, T_reference_cam in _frames(record.odometry):
         reference = known.get(reference_id)

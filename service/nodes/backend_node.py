@@ -2,7 +2,7 @@
 
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Collection
 from concurrent.futures import Future
 
 import numpy as np
@@ -11,8 +11,8 @@ from seamark import __version__
 from seamark.backend.config import MapConfig
 from seamark.backend.errors import MapError, MapUnwritableError
 from seamark.backend.graph_types import Solver
-from seamark.backend.map_prune import KEEP_SHARE, budget, choose, views_of
-from seamark.backend.map_store import FEATURES, MapStore
+from seamark.backend.map_open import loader, restore
+from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam, StepResult
 from seamark.backend.solver import SolverProcess
 from seamark.backend.types import MapSnapshot
@@ -22,7 +22,8 @@ from seamark.frontend.types import Keyframe, Mode
 from seamark.service import topics
 from seamark.service.bus import Bus
 from seamark.service.config import config_hash
-from seamark.service.nodes.map_keeper import MAPPED, MapKeeper
+from seamark.service.nodes.map_keeper import MapKeeper
+from seamark.service.nodes.map_pruner import MapPruner
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
 from seamark.service.nodes.process import run_process
@@ -31,7 +32,6 @@ from seamark.service.requests import Done, Forget
 from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
-PRUNE_EVERY = 20  # keyframes
 
 
 class BackendNode:
@@ -59,10 +59,11 @@ class BackendNode:
         self._bus, self._slam, self._no_loops, self._solver = bus, slam, no_loops, solver
         self._meter = Meter(bus.node)
         self._keeper = None if store is None else MapKeeper(store, self._meter, patient=patient, frozen=frozen)
-        self._limits = limits or MapConfig()
+        self._pruner = None
+        if self._keeper is not None:
+            self._pruner = MapPruner(self._keeper, slam, limits or MapConfig(), self._meter, self._forget)
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
-        self._known: set[int] = set()
         self._refused: set[int] = set()
         self._next_keyframe_id = 0
         self._next_session = 0
@@ -110,21 +111,13 @@ class BackendNode:
 
     def _restore(self, store: MapStore) -> None:
         """Take in the map from before; keyframes stored and not yet mapped wait for their candidates again."""
-        meta = store.meta()
-        mapped, before = int(meta.get(MAPPED, -1)), []
-        for keyframe in store.load_nodes():
+        before, waiting = restore(self._slam, store)
+        for keyframe in (*before, *waiting):
             self._remember(keyframe)
-            if keyframe.id <= mapped:
-                before.append(keyframe)
-            else:
-                self._waiting[keyframe.id] = store.keyframe(keyframe.id)
-        if before:
-            loops = [loop for loop in store.load_loops() if loop.query_id <= mapped and loop.match_id <= mapped]
-            self._slam.restore(before, loops, store.load_poses(), int(meta.get("revision", 0)))
+        self._waiting |= {keyframe.id: keyframe for keyframe in waiting}
         self._meter.keep("keyframes_restored", len(before))
 
     def _remember(self, keyframe: Keyframe) -> None:
-        self._known.add(keyframe.id)
         self._next_keyframe_id = max(self._next_keyframe_id, keyframe.id + 1)
         self._next_session = max(self._next_session, keyframe.session + 1)
         self._meter.keep("next_keyframe_id", self._next_keyframe_id)
@@ -132,7 +125,7 @@ class BackendNode:
 
     def _on_keyframe(self, keyframe: Keyframe) -> None:
         with self._lock:
-            if keyframe.id in self._known:
+            if keyframe.id < self._next_keyframe_id:  # they come in order
                 self._meter.count("keyframes_again")
                 return
             if self._keeper is not None:
@@ -157,7 +150,7 @@ class BackendNode:
     def _on_candidates(self, candidates: Candidates) -> "Future[None] | None":
         keyframe_id = candidates.query_id
         with self._lock:
-            mapped_before = keyframe_id in self._known and keyframe_id not in self._waiting
+            mapped_before = keyframe_id < self._next_keyframe_id and keyframe_id not in self._waiting
             if mapped_before or keyframe_id in self._refused:
                 self._meter.count("candidates_again")
                 return None
@@ -191,11 +184,11 @@ class BackendNode:
             with self._meter.timed("map"):
                 result = self._slam.step(keyframe, candidates)
             self._tell(result, keyframe_id, mapped)
-            if self._keeper is not None and keyframe_id % PRUNE_EVERY == 0:
-                self._prune(self._keeper)
         except Exception as error:
             mapped.set_exception(error)
             raise
+        if self._pruner is not None:
+            self._pruner.mapped(keyframe_id)
 
     def _tell(self, result: StepResult, mapped_id: int | None = None, mapped: "Future[None] | None" = None) -> None:
         """Write down and publish what a step has found; ``mapped`` is done when it is on disk."""
@@ -212,20 +205,9 @@ class BackendNode:
             self._meter.count("optimisations")
             self._bus.publish(topics.MAP, snapshot)
 
-    def _prune(self, keeper: MapKeeper) -> None:
-        """Keep the map within its budget; it is looked at now and then, because counting reads the file."""
-        keep = budget(keeper.store, self._limits)
-        if keep is None or keeper.store.file.read_only:
-            return
-        with self._meter.timed("prune"):
-            keep = budget(keeper.store, self._limits, KEEP_SHARE) or keep
-            joined = ((loop.query_id, loop.match_id) for loop in keeper.store.load_loops() if loop.accepted)
-            pruning = choose(views_of(keeper.store), keep, joined, self._limits)
-        self._meter.keep("views_over_budget", max(0, pruning.kept - pruning.wanted))
-        if pruning.forget and keeper.forget(pruning.forget):
-            self._slam.forget(pruning.forget)
-            self._bus.send(topics.FORGET, Forget(np.array(pruning.forget, np.int64)))
-            self._meter.count("views_forgotten", len(pruning.forget))
+    def _forget(self, keyframe_ids: Collection[int]) -> None:
+        """Have the vocabulary drop places that the map no longer has."""
+        self._bus.send(topics.FORGET, Forget(np.array(sorted(keyframe_ids), np.int64)))
 
     def _rank(self, observation: PlaceObservation) -> Candidates:
         self._meter.count("place_queries")
@@ -249,7 +231,7 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
             solver = _solver(settings)
         return BackendNode(
             bus,
-            Slam(config.backend, mode, solver, config.seed, None if store is None else _loader(store)),
+            Slam(config.backend, mode, solver, config.seed, None if store is None else loader(store)),
             store,
             config.frontend,
             settings.rig.cam0 if settings.rig else None,
@@ -280,11 +262,6 @@ def _open(settings: NodeSettings) -> MapStore | None:
         if not settings.patient:
             raise
         return MapStore(path, read_only=True)
-
-
-def _loader(store: MapStore) -> Callable[[int], Keyframe]:
-    """Return a reader of keyframes' features."""
-    return lambda keyframe_id: store.keyframe(keyframe_id, (FEATURES,))
 
 
 def _solver(settings: NodeSettings) -> Solver:

@@ -3,10 +3,12 @@
 import logging
 import shutil
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import Future
 
 from seamark.backend.errors import MapError, MapUnwritableError
+from seamark.backend.map_contraction import Contracted
+from seamark.backend.map_open import MAPPED
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot
 from seamark.frontend.types import Keyframe
@@ -15,7 +17,6 @@ from seamark.service.nodes.meter import Meter
 
 logger = logging.getLogger(__name__)
 
-MAPPED = "mapped"  # in the map's meta: the id of the last keyframe whose candidates have been seen to
 RETRY_EVERY_S = 1.0
 ROOM_BYTES = 4 << 20  # free space from which a keyframe is expected to find room
 LEARNING = "learning"  # counter of the status: 1, or 0 while the map takes nothing
@@ -87,11 +88,12 @@ class MapKeeper:
             else:
                 self._recover()
 
-    def forget(self, keyframe_ids: Sequence[int]) -> bool:
-        """Delete the views of keyframes; return False, and leave them, where the disk does not even take that."""
+    def contract(self, change: Contracted) -> bool:
+        """Forget keyframes; return False, and leave the map as it is, where the disk does not even take that."""
         with self._lock:
             try:
-                self.store.forget(keyframe_ids)
+                self._write_pending()
+                self.store.contract(change)
             except MapUnwritableError as error:
                 self._degrade(error)
                 return False

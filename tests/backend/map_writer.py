@@ -17,6 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from seamark.backend.config import BackendConfig
+from seamark.backend.contraction import contract
+from seamark.backend.graph_types import Constraint, Node
+from seamark.backend.map_contraction import contracted
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
 from seamark.frontend.types import Features, Keyframe
@@ -51,6 +55,22 @@ def keyframe(number: int) -> Keyframe:
     )
 
 
+def loop(query: int, match: int) -> Loop:
+    """Return a loop that says by its inliers whose it is."""
+    return Loop(query, match, True, Reason.ACCEPTED, query, 0.5, 0.25, 0.125, np.eye(4), np.eye(6))
+
+
+def forget(store: MapStore, newest: int) -> None:
+    """Take keyframes out of the map, as pruning does: two loops become one, the successor starts the chain."""
+    keyframes = [store.keyframe(one) for one in store.keyframe_ids()]
+    nodes = [Node(k.id, k.session, k.previous_id, k.T_odom_cam, k.covariance) for k in keyframes]  # type: ignore[arg-type]
+    loops = {(one.query_id, one.match_id): one for one in store.load_loops()}
+    constraints = [Constraint(*key, one.T_match_query, one.covariance) for key, one in loops.items()]  # type: ignore[arg-type]
+    graph = contract(nodes, constraints, [node.id for node in nodes if node.id <= newest], BackendConfig().drift)
+    components = {session.id: session.component for session in store.load_sessions()}
+    store.contract(contracted(graph, loops, components))
+
+
 def write(path: Path, acknowledge: int) -> None:
     """Go on where the file ends: a keyframe, its loop, now and then poses and something forgotten."""
     store = MapStore(path)
@@ -60,16 +80,16 @@ def write(path: Path, acknowledge: int) -> None:
     while True:
         store.add_keyframe(keyframe(number))
         if number:
-            loop = Loop(number, number - 1, True, Reason.ACCEPTED, number, 0.5, 0.25, 0.125, np.eye(4))
+            loops = [loop(number, number - gap) for gap in (1, 3) if number >= gap + max(0, number - FORGET_AFTER)]
             snapshot = None
             if number % 5 == 0:
                 ids = np.arange(max(0, number - 10), number + 1)
                 T = np.tile(np.eye(4), (len(ids), 1, 1))
                 T[:, 0, 3] = number
                 snapshot = MapSnapshot(number, ids, ids // 100, ids * 0, T, np.ones(len(ids)), ())
-            store.record([loop], snapshot, {"mapped": str(number)})
+            store.record(loops, snapshot, {"mapped": str(number)})
         if number >= FORGET_AFTER:
-            store.forget([number - FORGET_AFTER])
+            forget(store, number - FORGET_AFTER)
         os.write(acknowledge, f"{number}\n".encode())
         number += 1
 

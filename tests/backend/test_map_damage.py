@@ -11,10 +11,12 @@ import pytest
 
 from seamark.backend.errors import MapError
 from seamark.backend.evidence import Evidence, Gate
+from seamark.backend.graph_types import Span
 from seamark.backend.map_carve import carve
 from seamark.backend.map_check import check_map
+from seamark.backend.map_codec import encode_span, sealed
 from seamark.backend.map_repair import repair_map
-from seamark.backend.map_schema import COLUMNS
+from seamark.backend.map_schema import COLUMNS, upsert
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
 from seamark.frontend.types import Keyframe
@@ -54,7 +56,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory, template: Keyframe) -> Path:
         T_map = np.tile(np.eye(4), (COUNT, 1, 1))
         T_map[:, 0, 3] = ids
         store.update_poses(MapSnapshot(9, ids, ids // 30, ids * 0, T_map, np.ones(COUNT), ()))
-        store.forget([5])
+        with store.file.writing() as database:  # as earlier versions forgot
+            for table in ("images", "landmarks", "features"):
+                database.executemany(f"DELETE FROM {table} WHERE keyframe_id = ?", [(number,) for number in [5]])
+            span = Span(3, 0.5, 1.25, np.diag([1e-4] * 6))
+            database.execute(upsert("spans"), sealed("spans", encode_span(7, span)))
+            key = database.execute("SELECT query_id, match_id FROM loops ORDER BY 1, 2").fetchone()
+            database.execute(upsert("composed"), sealed("composed", (*key, 2, 0.001)))
     return path
 
 
@@ -69,6 +77,9 @@ def test_a_whole_map_is_whole(whole: Path, tmp_path: Path) -> None:
     report = check_map(whole)
     assert report.problems == ()
     assert report.rows == {
+        "views": 59,
+        "spans": 1,
+        "composed": 1,
         "meta": 3,
         "sessions": 2,
         "cameras": 1,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from seamark.backend.config import MapConfig
-from seamark.backend.map_prune import View, choose, lighting_of
+from seamark.backend.map_codec import lighting_of
+from seamark.backend.map_prune import View, choose
 
 CONFIG = MapConfig(place_m=1.0, place_deg=20.0, lighting=0.12)
 DAY, NIGHT = np.array([0.6, 0.6, 0.6, 0.2, 0.2, 0.2]), np.array([0.1, 0.1, 0.15, 0.1, 0.1, 0.1])

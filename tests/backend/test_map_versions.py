@@ -102,3 +102,27 @@ def test_a_damaged_old_map_is_refused_and_repaired(tmp_path: Path) -> None:
     assert report.damaged == ["row 1 of keyframes"]
     with MapStore(tmp_path / "other.seamark") as store:
         assert store.keyframe_ids() == [0, 2, 3] and store.load_loops()[0].match_id == 0
+
+
+def test_version_2_is_brought_up_to_date_with_all_its_views(tmp_path: Path) -> None:
+    """Test: a map with three sessions, a loop that was withdrawn and came back, and two forgotten keyframes."""
+    path = tmp_path / "map.seamark"
+    shutil.copy(GOLDEN / "map_v2.seamark", path)
+    with pytest.raises(MapVersionError, match="has map version 2"):
+        MapStore(path, read_only=True)
+    saved = repair_map(path, tmp_path / "new.seamark")
+    assert (saved.damaged, saved.lost, saved.mended) == ([], [], [])
+    for name in ("map.seamark", "new.seamark"):
+        with MapStore(tmp_path / name) as store:
+            assert store.keyframe_ids() == list(range(10))
+            assert store.keyframe_ids(recognisable=True) == [0, 1, 2, 3, 4, 5, 8, 9]
+            assert [verdict.accepted for verdict in store.history(8, 3)] == [True, False, True]
+            evidence = store.evidence(8, 3)
+            assert evidence is not None and evidence.inliers.tolist() == [True, True, False, True, True]
+            assert {session.id: session.component for session in store.load_sessions()} == {0: 0, 1: 0, 4: 0}
+            assert store.load_spans() == {} and store.load_means() == {}
+            light = store.load_lightings()
+            assert list(light) == [0, 1, 2, 3, 4, 5, 8, 9]
+            thumbnail = store.keyframe(9).thumbnail.reshape(-1, 3) / 255
+            np.testing.assert_allclose(light[9], [*thumbnail.mean(axis=0), *thumbnail.std(axis=0)], atol=1e-12)
+        assert check_map(tmp_path / name).problems == ()
