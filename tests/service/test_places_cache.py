@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from seamark.backend.config import DriftConfig
+from seamark.backend.contraction import contract
+from seamark.backend.graph_types import Node
+from seamark.backend.map_contraction import contracted
 from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Features, Keyframe, Mode
 from seamark.service import topics
@@ -24,6 +28,12 @@ COUNT = 40
 
 
 @pytest.fixture(scope="module")
+def forget(store: MapStore, keyframe_ids: list[int]) -> None:
+    nodes = [Node(one.id, one.session, one.previous_id, np.eye(4), np.zeros((6, 6))) for one in store.load_nodes()]
+    graph = contract(nodes, [], keyframe_ids, DriftConfig())
+    store.contract(contracted(graph, {}, {node.session: node.session for node in nodes}))
+
+
 def vocabulary_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(0)
     path = tmp_path_factory.mktemp("words") / "small.vocab"
@@ -124,7 +134,7 @@ def test_what_the_map_got_and_lost_since_is_followed(tmp_path: Path, vocabulary_
     path = fill(tmp_path, range(COUNT))
     Run(path, vocabulary_file).end()
     with MapStore(path) as store:
-        store.forget([3, 4, 5])
+        forget(store, [3, 4, 5])
         for number in range(COUNT, COUNT + 5):
             store.add_keyframe(keyframe(number))
         store.add_keyframe(replace(keyframe(COUNT - 1), stamp_ns=10**9 * COUNT - 1))
@@ -146,7 +156,7 @@ def test_what_comes_and_goes_in_a_run_is_kept(tmp_path: Path, vocabulary_file: P
     run.end()
     path = fill(tmp_path, range(COUNT))
     with MapStore(path) as store:
-        store.forget([7])
+        forget(store, [7])
     again = Run(path, vocabulary_file)
     assert again.counters()["places_described_at_start"] == 0
     same_answers(again, anew(path, vocabulary_file))
