@@ -30,6 +30,9 @@ def follow(
 def strongest(
     image: NDArray[np.uint8], cell: int, border: int, harris_k: float, mask: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]: ...
+def sift(
+    image: NDArray[np.uint8], mask: NDArray[np.uint8] | None, most: int, contrast: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]: ...
 def median_difference(image: NDArray[np.uint8]) -> float: ...
 def apart(
     points: NDArray[np.float32], others: NDArray[np.float32], distance: float, to_each_other: bool

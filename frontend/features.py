@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.frontend.kernels import native
 from seamark.frontend.types import Features
 
+GREY_LEVELS = 255
 DESCRIPTOR_SCALE = 512.0  # sqrt of an L1-normalised SIFT bin rarely exceeds 0.5
 
 
@@ -18,6 +20,7 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Map SIFT descriptors (N, 128) to RootSIFT in uint8: Euclidean distance becomes Hellinger's (Arandjelovic
     2012).
     """
+    descriptors = descriptors.astype(np.float32, copy=False)
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
     return np.minimum(np.rint(DESCRIPTOR_SCALE * np.sqrt(descriptors / total)), 255).astype(np.uint8)
 
@@ -40,16 +43,11 @@ def extract_features(
         size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         mask = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
-    sift = cv2.SIFT_create(nfeatures=n_features, contrastThreshold=contrast, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey, mask)
-    if descriptors is None or len(keypoints) == 0:
-        return Features.empty()
-    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float32)
+    mask = None if mask is None else np.ascontiguousarray(mask, np.uint8)
+    table, descriptors = native.sift(np.ascontiguousarray(grey), mask, n_features, GREY_LEVELS * contrast)
     whole = np.array(image.shape[1::-1]) / np.array(grey.shape[1::-1])
     table[:, :2] = (table[:, :2] + 0.5) * whole - 0.5
     table[:, 2] /= scale
-    order = np.lexsort((table[:, 1], table[:, 0], -table[:, 4]))[:n_features]
-    table, descriptors = table[order], descriptors[order]
     return Features(
         points=np.ascontiguousarray(table[:, :2]),
         scales=np.ascontiguousarray(table[:, 2]),

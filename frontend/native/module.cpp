@@ -19,6 +19,7 @@
 #include "patches.hpp"
 #include "pose.hpp"
 #include "pyramid.hpp"
+#include "sift.hpp"
 #include "window.hpp"
 
 namespace nb = nanobind;
@@ -205,6 +206,21 @@ std::tuple<Out<double, -1>, Flags> errors_of(
     return {give<double, -1>(std::move(errors), {n}), give_flags(in_front, n)};
 }
 
+std::tuple<Out<float, -1, 5>, Out<uint8_t, -1, kDescriptor>> sift_of(const Rows& image, const std::optional<Grey>& mask,
+                                                                     int64_t most, float contrast) {
+    const Level level = level_with(image);
+    require(!mask || (mask->shape(0) == image.shape(0) && mask->shape(1) == image.shape(1)), "a mask has the size of its image");
+    require(most > 0, "key points are asked for");
+    KeyPoints found;
+    {
+        nb::gil_scoped_release free;
+        found = sift(level, mask ? mask->data() : nullptr, most, contrast);
+    }
+    const size_t n = found.table.size() / 5;
+    return {give<float, -1, 5>(std::move(found.table), {n, 5}),
+            give<uint8_t, -1, kDescriptor>(std::move(found.descriptors), {n, kDescriptor})};
+}
+
 void check(const Bundle& bundle, const In<int64_t, -1>& keyframe_of, const In<int64_t, -1>& landmark_of) {
     const size_t n = bundle.seen.n;
     require(keyframe_of.shape(0) == n && landmark_of.shape(0) == n, "each observation needs a keyframe and a landmark");
@@ -264,6 +280,7 @@ NB_MODULE(_native, m) {
     m.def("strongest", &strongest_of, "image"_a.noconvert(), "cell"_a, "border"_a, "harris_k"_a, "mask"_a.noconvert().none());
     m.def("median_difference", [](const Rows& image) { return median_difference(level_with(image)); },
           "image"_a.noconvert());
+    m.def("sift", &sift_of, "image"_a.noconvert(), "mask"_a.noconvert().none(), "most"_a, "contrast"_a);
     m.def("apart", &apart_from, "points"_a, "others"_a, "distance"_a, "to_each_other"_a);
     m.def(
         "align_along",

@@ -105,3 +105,55 @@ def test_features_of_a_reduced_image_lie_where_those_of_the_whole_one_do() -> No
     assert reduced.points[:, 0].max() < 503
     same = extract_features(image, 500, mask=mask, max_pixels=image.size)
     np.testing.assert_array_equal(same.points, extract_features(image, 500, mask=mask).points)
+
+
+def blobs() -> np.ndarray:
+    """Return bright and dark spots, bars and noise of many sizes."""
+    rng = np.random.default_rng(4)
+    image = np.full((260, 372), 120.0)
+    for _ in range(220):
+        centre, axes = tuple(rng.integers(0, (372, 260)).tolist()), tuple(rng.integers(2, 22, 2).tolist())
+        cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(20, 235)), -1)
+    return np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("image", [blobs(), textured(301, 203)], ids=["blobs", "texture"])
+def test_key_points_are_those_of_opencv(image: np.ndarray) -> None:
+    """Test: OpenCV's SIFT of the same image. Expected: the same key points but for a few at the thresholds, in the same
+    places, with the same descriptors but for rounding.
+    """
+    theirs, their_descriptors = cv2.SIFT_create(
+        5000, contrastThreshold=0.015, enable_precise_upscale=True
+    ).detectAndCompute(image, None)
+    expected = np.array([(*k.pt, np.log(k.size), k.angle) for k in theirs])
+    own = extract_features(image, 5000)
+    found = np.column_stack([own.points, np.log(own.scales), np.rad2deg(own.angles)])
+    assert len(found) == pytest.approx(len(expected), rel=0.03)
+    apart = np.abs(found[:, None] - expected[None])
+    apart[..., 3] = np.minimum(apart[..., 3], 360 - apart[..., 3])
+    same = (apart < (0.02, 0.02, 0.01, 1.0)).all(axis=2)
+    assert same.any(axis=1).mean() > 0.93
+    mine = np.flatnonzero(same.any(axis=1))
+    difference = np.linalg.norm(
+        own.descriptors[mine].astype(float) - root_sift(their_descriptors[same[mine].argmax(axis=1)]).astype(float),
+        axis=1,
+    )
+    assert np.median(difference) < 2
+    assert np.percentile(difference, 95) < 10
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 300), (300, 7), (8, 8), (33, 17)])
+def test_key_points_of_small_images(shape: tuple[int, int]) -> None:
+    """Expected: what there is lies inside, and an image too small for the scale space has nothing."""
+    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    points = extract_features(image, 100).points
+    assert ((points >= 0) & (points <= np.array(shape[::-1]) - 1)).all()
+    assert len(points) == 0 or min(shape) >= 8
+
+
+def test_key_points_of_a_part_of_an_image_are_found_again() -> None:
+    """Test: a view whose rows lie apart in memory. Expected: the same as of a copy."""
+    part = textured()[20:200, 30:290]
+    np.testing.assert_array_equal(
+        extract_features(part, 300).descriptors, extract_features(part.copy(), 300).descriptors
+    )

@@ -1,0 +1,49 @@
+// The Gaussian scale space of an image and the extrema of its differences: Lowe, "Distinctive Image Features from
+// Scale-Invariant Keypoints" (2004), sections 3 and 4.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "pyramid.hpp"
+
+namespace seamark {
+
+constexpr int kIntervals = 3;            // scales of an octave that can hold extrema
+constexpr int kScales = kIntervals + 3;  // of an octave
+constexpr float kSigma = 1.6f;           // blur of its first scale, in pixels of the octave
+
+// Grey levels; rows begin at multiples of 16 numbers, and up to 16 numbers after a row may be read.
+struct Plane {
+    float* values = nullptr;
+    int64_t stride = 0;
+    int width = 0, height = 0;
+    float* row(int y) const { return values + stride * y; }
+};
+
+struct Octave {
+    Plane scales[kScales];
+};
+
+// Where a difference of Gaussians is larger or smaller than all around it; x, y and sigma in pixels of its octave.
+struct Extremum {
+    int octave, layer;
+    float x, y, sigma, response;
+};
+
+// The first octave has twice the pixels of the image per side, each of the others half as many as the one before.
+class ScaleSpace {
+public:
+    explicit ScaleSpace(const Level& image, float contrast);
+
+    const std::vector<Extremum>& extrema() const { return extrema_; }
+    const Octave& octave(int index) const { return octaves_[index]; }
+
+private:
+    std::vector<Octave> octaves_;
+    std::vector<Extremum> extrema_;
+};
+
+}  // namespace seamark
