@@ -16,7 +16,7 @@ def grey_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+def root_sift(descriptors: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Map SIFT descriptors (N, 128) to RootSIFT in uint8: Euclidean distance becomes Hellinger's (Arandjelovic
     2012).
     """

@@ -13,7 +13,7 @@ from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.pose import estimate_pose
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
-from seamark.frontend.tracks import Tracks
+from seamark.frontend.tracks import Tracks, shared
 from seamark.frontend.two_view import TwoView, initialise
 from seamark.frontend.types import Filled, Frame
 
@@ -56,7 +56,8 @@ class MonoInitialiser:
     def attempt(self) -> tuple[TwoView, NDArray[np.int64]] | None:
         """Try the first against the newest view; returns the map and the track ids of its landmarks."""
         first, newest = self.views[0], self.views[-1]
-        ids, i, j = np.intersect1d(first.tracks.ids, newest.tracks.ids, assume_unique=True, return_indices=True)
+        i, j = shared(first.tracks.ids, newest.tracks.ids)
+        ids = first.tracks.ids[i]
         moved = np.linalg.norm(first.pixels[i] - newest.pixels[j], axis=1)
         if len(ids) == 0 or float(np.median(moved)) < self.config.initial_parallax_px:
             self.refusal = "little_motion"

@@ -16,6 +16,7 @@ ITERATIONS = 8
 CONVERGED = 1e-7
 NEAREST_M = 1e-3
 CONTESTED_SHARE = 0.8  # of all votes: where fewer agree with a pose, others are asked for
+UNCONTESTED_SHARE = 0.8  # of all votes: where more agree with the pose that the prediction leads to, nothing is sampled
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -60,6 +61,7 @@ def estimate_pose(
 ) -> PoseEstimate | None:
     """Estimate the pose; None when fewer than ``minimum`` landmarks agree.
 
+    The prediction is refined first; where nearly all landmarks agree with what it leads to, that is the pose. Elsewhere
     P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`refine_pose` twice, the second time on the inliers of
     the refined pose. With a prediction, landmarks of uncertain distance take part: they hold the rotation, and the
     translation across their line of sight. ``votes`` (N,) weigh the landmarks where they disagree: then what the others
@@ -69,14 +71,9 @@ def estimate_pose(
     if len(observations.landmarks) < max(4, minimum):
         return None
     votes = np.ones(len(observations.landmarks)) if votes is None else votes
-    if start is not None:
-        starts = [(start.T_odom_cam, start.inliers)]
-    else:
-        sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
-        starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, prediction, votes)
-    best, best_score = None, np.inf
-    for T_odom_cam, inliers in starts:
-        found = _converge(
+
+    def converge(T_odom_cam: Array, inliers: NDArray[np.bool_]) -> tuple[PoseEstimate, float] | None:
+        return _converge(
             T_odom_cam,
             inliers,
             observations,
@@ -87,6 +84,19 @@ def estimate_pose(
             prediction=prediction,
             votes=votes,
         )
+
+    if start is not None:
+        starts = [(start.T_odom_cam, start.inliers)]
+    else:
+        if prediction is not None:
+            expected = converge(prediction.T_odom_cam, np.ones(len(observations.landmarks), bool))
+            if expected is not None and votes[expected[0].inliers].sum() > UNCONTESTED_SHARE * votes.sum():
+                return expected[0]
+        sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
+        starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, prediction, votes)
+    best, best_score = None, np.inf
+    for T_odom_cam, inliers in starts:
+        found = converge(T_odom_cam, inliers)
         if found is not None and found[1] < best_score:
             best, best_score = found
     return best
@@ -167,9 +177,11 @@ def _converge(
         except np.linalg.LinAlgError:  # landmarks on one line leave the rotation about it open
             return None
         errors, in_front = whitened_errors(T_odom_cam, observations, camera, pixel_sigma)
-        inliers = in_front & (errors < threshold_px)
+        before, inliers = inliers, in_front & (errors < threshold_px)
         if inliers.sum() < minimum:
             return None
+        if (before == inliers).all():
+            break
     score = float((votes * np.where(inliers, errors, threshold_px)).sum())
     return PoseEstimate(T_odom_cam, inliers, float(np.median(errors[inliers])), covariance), score
 

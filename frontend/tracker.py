@@ -12,7 +12,7 @@ from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
 from seamark.frontend.static_votes import static_votes
 from seamark.frontend.tone import match_tone
-from seamark.frontend.tracks import Tracks
+from seamark.frontend.tracks import Tracks, shared
 from seamark.frontend.two_view import rotation_compensated_parallax
 from seamark.frontend.types import Frame
 from seamark.frontend.window import WindowKeyframe
@@ -94,7 +94,7 @@ def estimate(
     reading = sensor.inverse_depth(frame, tracks.pixels) if isinstance(sensor, DepthImage) else (unknown, unknown)
     observations, known = session.observations(tracks, *reading)
     votes = static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera)
-    pose = None
+    pose, prediction = None, session.prediction()
     for threshold_px in (session.gate_px(), c.pnp_threshold_px):
         pose = estimate_pose(
             observations,
@@ -103,7 +103,7 @@ def estimate(
             iterations=c.pnp_iterations,
             pixel_sigma=c.pixel_sigma,
             minimum=c.min_inliers,
-            prediction=session.prediction(),
+            prediction=prediction,
             votes=votes,
             start=start,
         )
@@ -124,7 +124,7 @@ def abrupt(session: Session, pose: PoseEstimate) -> bool:
 def settle(session: Session, image: Pyramid, tracks: Tracks, T_odom_cam: NDArray[np.float64]) -> Tracks:
     """Align tracks once more with their patches in the newest keyframe, warped as the pose says; undoes their drift."""
     reference, camera = session.reference, session.camera
-    _, mine, theirs = np.intersect1d(tracks.ids, reference.track_ids, assume_unique=True, return_indices=True)
+    mine, theirs = shared(tracks.ids, reference.track_ids)
     positions = session.landmarks.get(tracks.ids[mine])
     known = np.isfinite(positions[:, 0])
     mine, theirs = mine[known], theirs[known]
@@ -173,8 +173,8 @@ def map_keyframe_due(session: Session, stamp_ns: int) -> bool:
     mapped = session.mapped
     if mapped is None:
         return True
-    shared = np.isin(mapped.track_ids, session.tracks.ids).sum()
-    if shared < max(session.config.good_inliers, session.config.keyframe_shared_ratio * len(mapped.track_ids)):
+    still_seen = len(shared(mapped.track_ids, session.tracks.ids)[0])
+    if still_seen < max(session.config.good_inliers, session.config.keyframe_shared_ratio * len(mapped.track_ids)):
         return True
     return _moved_on(session, mapped, stamp_ns)
 
@@ -185,7 +185,7 @@ def _moved_on(session: Session, keyframe: WindowKeyframe, stamp_ns: int) -> bool
     R_keyframe_cam = keyframe.T_odom_cam[:3, :3].T @ session.T_odom_cam[:3, :3]
     if float(se3.rotation_angle(R_keyframe_cam)) > np.deg2rad(c.keyframe_rotation_deg):
         return True
-    _, i, j = np.intersect1d(keyframe.track_ids, session.tracks.ids, assume_unique=True, return_indices=True)
+    i, j = shared(keyframe.track_ids, session.tracks.ids)
     if len(i) == 0:
         return True
     rays = session.camera.rays(session.tracks.pixels[j])

@@ -31,6 +31,19 @@ class Tracks:
         return Tracks(np.concatenate([self.ids, more.ids]), np.vstack([self.pixels, more.pixels]))
 
 
+def shared(a: NDArray[np.int64], b: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return where the ids that are in both a (N,) and b (M,) stand in each, (K,) and (K,), ascending in a.
+
+    An id is in each once.
+    """
+    if len(b) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    order = np.argsort(b)
+    place = order[np.minimum(np.searchsorted(b, a, sorter=order), len(b) - 1)]
+    both = np.flatnonzero(b[place] == a)
+    return both, place[both]
+
+
 class TrackAges:
     """Counts for how many posed frames of a session each track has lived."""
 

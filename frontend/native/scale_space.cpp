@@ -1,5 +1,5 @@
 // An octave is made row by row, all its scales together: as soon as the rows that a blur needs are there, it goes on, so
-// that all but the planes themselves stays in the second-level cache. The extrema of a row follow behind.
+// that all but the planes themselves stays in the second-level cache. The search of a row for extrema follows behind.
 #include "scale_space.hpp"
 
 #include <algorithm>
@@ -267,9 +267,15 @@ bool refine(const Octave& octave, int layer, int x, int y, float contrast, Extre
     }
 }
 
-// Makes an octave and finds its extrema. Its first scale is that of the image, or every other pixel of the octave before.
-SEAMARK_CLONES void make_octave(const Level& image, const Octave* before, int index, float contrast, const Octave& octave,
-                                std::vector<Extremum>& found) {
+struct Candidate {
+    int layer, x, y;
+};
+
+// Makes an octave and finds what may be its extrema. Its first scale is that of the image, or every other pixel of the
+// octave before.
+SEAMARK_CLONES std::vector<Candidate> make_octave(const Level& image, const Octave* before, float contrast,
+                                                  const Octave& octave) {
+    std::vector<Candidate> candidates;
     const Plane* scales = octave.scales;
     const int width = scales[0].width, height = scales[0].height;
     std::vector<float> buffer(padded(width) + 2 * kPad + kVector);
@@ -295,12 +301,10 @@ SEAMARK_CLONES void make_octave(const Level& image, const Octave* before, int in
         stack_rows(at, width, differences);
         for (int layer = 1; layer <= kIntervals; ++layer)
             search_row(layer, at, width, threshold, differences, [&](int x) {
-                Extremum extremum;
-                if (x < kEdge || x >= width - kEdge || !refine(octave, layer, x, at, contrast, extremum)) return;
-                extremum.octave = index;
-                found.push_back(extremum);
+                if (x >= kEdge && x < width - kEdge) candidates.push_back({layer, x, at});
             });
     }
+    return candidates;
 }
 
 // Memory for the planes of one image: a thread that takes image after image does not ask for it anew each time.
@@ -334,8 +338,14 @@ ScaleSpace::ScaleSpace(const Level& image, float contrast) {
             next += plane.stride * height;
         }
         octaves_.push_back(octave);
-        make_octave(image, octaves_.size() > 1 ? &octaves_[octaves_.size() - 2] : nullptr,
-                    static_cast<int>(octaves_.size()) - 1, contrast, octave, extrema_);
+        const int index = static_cast<int>(octaves_.size()) - 1;
+        // Refined only now: an extremum may move into rows that were not there when it was found.
+        for (const Candidate& c : make_octave(image, index ? &octaves_[index - 1] : nullptr, contrast, octave)) {
+            Extremum extremum;
+            if (!refine(octave, c.layer, c.x, c.y, contrast, extremum)) continue;
+            extremum.octave = index;
+            extrema_.push_back(extremum);
+        }
     }
 }
 

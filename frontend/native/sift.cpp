@@ -207,8 +207,11 @@ KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float cont
     std::vector<Extremum> extrema;
     for (const Extremum& extremum : space.extrema())
         if (!mask || allowed(extremum)) extrema.push_back(extremum);
-    const auto order = [&](const Extremum& e) { return std::make_tuple(-e.response, e.x * unit(e), e.y * unit(e)); };
+    const auto order = [&](const Extremum& e) { return std::make_tuple(-e.response, e.x * unit(e), e.y * unit(e), e.sigma); };
     std::sort(extrema.begin(), extrema.end(), [&](const auto& a, const auto& b) { return order(a) < order(b); });
+    // Neighbours that have moved to the same place are one.
+    const auto same = [&](const auto& a, const auto& b) { return order(a) == order(b); };
+    extrema.erase(std::unique(extrema.begin(), extrema.end(), same), extrema.end());
 
     const auto plane = [&space](const Extremum& e) { return space.octave(e.octave).scales[e.layer]; };
     std::vector<Oriented> oriented;
