@@ -27,13 +27,13 @@ from seamark.vocab.vocabulary import Vocabulary
 COUNT = 40
 
 
-@pytest.fixture(scope="module")
 def forget(store: MapStore, keyframe_ids: list[int]) -> None:
     nodes = [Node(one.id, one.session, one.previous_id, np.eye(4), np.zeros((6, 6))) for one in store.load_nodes()]
     graph = contract(nodes, [], keyframe_ids, DriftConfig())
     store.contract(contracted(graph, {}, {node.session: node.session for node in nodes}))
 
 
+@pytest.fixture(scope="module")
 def vocabulary_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(0)
     path = tmp_path_factory.mktemp("words") / "small.vocab"
