@@ -2,6 +2,7 @@
 
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -261,6 +262,11 @@ class MapStore:
     def export_single_file(self) -> None:
         """Move the write-ahead log into the file, so that ``path`` alone is the whole map."""
         self.file.checkpoint()
+
+    def copy(self, path: Path) -> None:
+        """Write the map as it is at this moment to a new file."""
+        with self.file.translated("copied"), closing(sqlite3.connect(path)) as target:
+            self.file.database.backup(target)
 
     def compact(self) -> None:
         """Give the space of what was deleted back to the disk; needs room for a second copy meanwhile."""

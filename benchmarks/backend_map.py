@@ -2,6 +2,7 @@
 
     .venv/bin/python benchmarks/backend_map.py commit --keyframes 500
     .venv/bin/python benchmarks/backend_map.py recover --keyframes 10000
+    .venv/bin/python benchmarks/backend_map.py service --keyframes 10000
     .venv/bin/python benchmarks/backend_map.py laps --laps 50
 
 Keyframes are synthetic: descriptors of the length and density of RootSIFT, 800 a picture, a JPEG of 60 kB of noise. Of
@@ -23,17 +24,24 @@ import cv2
 import numpy as np
 import psutil
 
+from seamark import SeamarkError
 from seamark.backend.config import BackendConfig, MapConfig, VerificationConfig
 from seamark.backend.map_open import loader, restore
 from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam
 from seamark.backend.solver import SolverProcess
 from seamark.backend.types import MapSnapshot
+from seamark.datasets_synth.toy import ToyWorld, toy_sequence
 from seamark.frontend.camera import Camera
-from seamark.frontend.types import Features, Keyframe, Mode
+from seamark.frontend.types import Features, Frame, Keyframe, Mode
+from seamark.service import topics
+from seamark.service.config import load_config
+from seamark.service.launcher import Launcher
 from seamark.service.nodes.map_keeper import MapKeeper
 from seamark.service.nodes.map_pruner import MapPruner
 from seamark.service.nodes.meter import Meter
+from seamark.service.nodes.settings import NodeSettings
+from seamark.service.requests import Empty, PlaceQuery
 from seamark.vocab.config import VocabConfig
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import Candidates, PlaceObservation
@@ -197,6 +205,70 @@ def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, An
     return rows
 
 
+def service(folder: Path, count: int) -> dict[str, object]:
+    """Kill all three processes of a service with a large map; return how long it takes until a place is right again.
+
+    The map is that of a drawn world again and again; the picture asked about is one of its frames.
+    """
+    small, large = folder / "small.seamark", folder / "map.seamark"
+    rig, seed = ToyWorld(5).rig(Mode.RGBD), 5
+    frames = [frame for frame in toy_sequence("loop", 120, seed, Mode.RGBD).frames() if isinstance(frame, Frame)]
+    settings = NodeSettings(Mode.RGBD, rig, load_config(), map_path=small, log_level="CRITICAL", patient=True)
+    with Launcher(settings) as launcher:
+        for frame in frames:
+            launcher.bus.request(topics.FRAME, frame, 60.0)
+        for node in topics.NODES:
+            launcher.bus.request(topics.DRAIN[node], Empty(), 60.0)
+    with MapStore(small) as store:
+        templates, poses = list(store.load_keyframes()), store.load_poses()
+        meta = store.meta()
+    with MapStore(large) as store:
+        store.file.database.execute("PRAGMA synchronous = OFF")  # only here: the file is not what is measured
+        T = []
+        for number in range(count):
+            one = templates[number % len(templates)]
+            previous = number - 1 if number else None
+            store.add_keyframe(replace(one, id=number, previous_id=previous, session=0, stamp_ns=10**9 * number))
+            T.append(poses[one.id][0])
+        ids = np.arange(count)
+        snapshot = MapSnapshot(1, ids, ids * 0, ids * 0, np.stack(T), np.ones(count), ())
+        store.record((), snapshot, meta | {"mapped": str(count - 1), "revision": "1"})
+    os.sync()
+    asked = templates[len(templates) // 2]
+    picture = next(frame.image for frame in frames if frame.file == asked.file)
+    query = PlaceQuery(bytes(cv2.imencode(".png", picture)[1]))
+    rows = []
+    with Launcher(replace(settings, map_path=large)) as launcher:
+        for _ in range(4):
+            right_s, status = (
+                until_right(launcher, query, asked.file),
+                launcher.bus.request(topics.STATUS["vocab"], Empty()),
+            )
+            rows.append({"s": round(right_s, 2), "described": status.counters.get("places_described_at_start")})
+            killed = [
+                child for child in psutil.Process().children() if "seamark.service.nodes" in " ".join(child.cmdline())
+            ]
+            assert len(killed) == 3
+            for child in killed:
+                child.kill()
+        until_right(launcher, query, asked.file)
+        began = time.perf_counter()
+    return {"keyframes": count, "until_right": rows, "stop_s": round(time.perf_counter() - began, 2)}
+
+
+def until_right(launcher: Launcher, query: PlaceQuery, file: str) -> float:
+    """Return how long it takes until the service names the place."""
+    began = time.perf_counter()
+    while True:
+        try:
+            reply = launcher.bus.request(topics.PLACE, query, 5.0)
+            if reply.places and reply.places[0].accepted and reply.places[0].file == file:
+                return time.perf_counter() - began
+        except SeamarkError:
+            launcher.check()
+        time.sleep(0.02)
+
+
 def error_m(snapshot: MapSnapshot, per_lap: int) -> float:
     """Return the RMS error of the kept keyframes' positions after rigid alignment with where they were."""
     true = np.stack([pose(number, per_lap)[:3, 3] for number in snapshot.keyframe_ids.tolist()])
@@ -228,7 +300,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("commit", "recover", "laps"))
+    parser.add_argument("what", choices=("commit", "recover", "service", "laps"))
     parser.add_argument("--keyframes", type=int, default=500)
     parser.add_argument("--laps", type=int, default=50)
     parser.add_argument("--per-lap", type=int, default=25)
@@ -241,6 +313,8 @@ def main() -> None:
             print(json.dumps(commit(Path(folder), options.keyframes)))
         elif options.what == "recover":
             print(json.dumps(recover(Path(folder), options.keyframes)))
+        elif options.what == "service":
+            print(json.dumps(service(Path(folder), options.keyframes)))
         else:
             rows = laps(Path(folder), options.laps, options.per_lap, options.keep)
             if options.plot is not None:

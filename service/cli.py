@@ -83,6 +83,9 @@ def run_command(
     no_loops: NoLoopsOption = False,
     in_process: Annotated[bool, typer.Option("--in-process", help="One process, same bits at every run.")] = False,
     realtime: RealtimeOption = False,
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="A map to go on with; it is copied and stays as it is.")
+    ] = None,
     as_json: JsonOption = False,
     override: OverrideOption = None,
     config: ConfigOption = None,
@@ -94,7 +97,7 @@ def run_command(
 
     settings = _config(config, override, seed)
     source = open_sources(sources, mode=mode, calib=calib, fps=fps)
-    options = RunOptions(out, tuple(sources), vocab, not no_loops, in_process, realtime)
+    options = RunOptions(out, tuple(sources), vocab, not no_loops, in_process, realtime, map_file)
     with Bar(source.name) as bar:
         record = run(source, options, settings, bar)
     report = build_report(record, for_mode(settings, record.mode))

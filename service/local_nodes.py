@@ -2,17 +2,20 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import psutil
 
+from seamark.service import topics
 from seamark.service.bus import Bus, LocalBus
 from seamark.service.nodes import backend_node, frontend_node, vocab_node
 from seamark.service.nodes.process import Node
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.topics import NODES, RUNNER
+from seamark.service.requests import Empty
+from seamark.service.topics import BACKEND, NODES, RUNNER
 from seamark.service.types import ProcessUsage
 
 BUILDERS: dict[str, Callable[[Bus, NodeSettings], Node]] = {
@@ -26,15 +29,21 @@ class LocalNodes:
     """What :class:`seamark.service.launcher.Launcher` is, without processes; a context manager."""
 
     def __init__(self, settings: NodeSettings) -> None:
-        self._settings = settings
+        map_exists = settings.map_path is not None and settings.map_path.exists()
+        self._settings = replace(settings, restore=map_exists)
         self._nodes: dict[str, Node] = {}
         self.bus = LocalBus(RUNNER)
         self.restarts = dict.fromkeys(NODES, 0)
 
     def __enter__(self) -> Self:
         try:
+            settings = self._settings
             for name in reversed(NODES):  # readers first
-                self._nodes[name] = BUILDERS[name](self.bus.for_node(name), self._settings)
+                self._nodes[name] = BUILDERS[name](self.bus.for_node(name), settings)
+                if name == BACKEND and settings.restore:
+                    counters = self.bus.request(topics.PROGRESS[BACKEND], Empty()).counters
+                    first = counters.get("next_keyframe_id", 0), counters.get("next_session", 0)
+                    settings = replace(settings, first_keyframe_id=first[0], first_session=first[1])
         except BaseException:
             self._close()
             raise

@@ -38,7 +38,7 @@ class RunOptions:
 
     ``in_process`` puts the nodes on a LocalBus, so that two runs give equal trajectories and tables. ``realtime`` sends
     frames no faster than their stamps say. ``vocabulary`` None is the one that ships with Seamark. ``sources`` are
-    named in the report.
+    named in the report. ``map_path`` is a map to go on with: the run works on a copy in ``out`` and leaves it as it is.
     """
 
     out: Path
@@ -47,6 +47,7 @@ class RunOptions:
     loops: bool = True
     in_process: bool = False
     realtime: bool = False
+    map_path: Path | None = None
 
 
 def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Progress | None = None) -> RunRecord:
@@ -56,6 +57,9 @@ def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Pr
     a folder that cannot be written to.
     """
     with prepare_output(options.out) as output:
+        if options.map_path is not None:
+            with MapStore(options.map_path, read_only=True) as store:
+                store.copy(output.staging / MAP_FILE)
         settings = NodeSettings(
             mode=source.mode,
             rig=source.rig,

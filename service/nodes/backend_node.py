@@ -7,9 +7,8 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from seamark import __version__
 from seamark.backend.config import MapConfig
-from seamark.backend.errors import MapError, MapUnwritableError
+from seamark.backend.errors import MapError
 from seamark.backend.graph_types import Solver
 from seamark.backend.map_open import loader, restore
 from seamark.backend.map_store import MapStore
@@ -21,8 +20,8 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.types import Keyframe, Mode
 from seamark.service import topics
 from seamark.service.bus import Bus
-from seamark.service.config import config_hash
 from seamark.service.nodes.map_keeper import MapKeeper
+from seamark.service.nodes.map_opening import open_map
 from seamark.service.nodes.map_pruner import MapPruner
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
@@ -222,11 +221,9 @@ class BackendNode:
 def build(bus: Bus, settings: NodeSettings) -> BackendNode:
     """Return the node for the settings; raises MapError and its kin when the map cannot be used."""
     config, mode = settings.config, settings.mode
-    store = _open(settings)
+    store = open_map(settings)
     solver: Solver | None = None
     try:
-        if store is not None:
-            _sign(store, settings)
         if mode is not Mode.PLACES:
             solver = _solver(settings)
         return BackendNode(
@@ -249,37 +246,12 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
         raise
 
 
-def _open(settings: NodeSettings) -> MapStore | None:
-    """Return the map; a patient service takes one that cannot be written as it is."""
-    path = settings.map_path
-    if path is None:
-        return None
-    if settings.localise_only:
-        return MapStore(path, read_only=True)
-    try:
-        return MapStore(path)
-    except MapUnwritableError:
-        if not settings.patient:
-            raise
-        return MapStore(path, read_only=True)
-
-
 def _solver(settings: NodeSettings) -> Solver:
     if settings.solver_process:
         return SolverProcess(settings.config.backend)
     from seamark.backend.pose_graph import PoseGraph  # loads GTSAM, which the node's own process does without
 
     return PoseGraph(settings.config.backend)
-
-
-def _sign(store: MapStore, settings: NodeSettings) -> None:
-    """Write into a new map what made it; refuse one that another mode has made."""
-    meta = store.meta()
-    if meta.get("mode", settings.mode) != settings.mode:
-        raise MapError(f"the map {store.path} was made in mode {meta['mode']} and cannot go on in {settings.mode}")
-    if "mode" not in meta and not store.file.read_only:
-        made_by = {"seamark": __version__, "config_hash": config_hash(settings.config)}
-        store.set_meta({"mode": str(settings.mode)} | made_by)
 
 
 if __name__ == "__main__":
