@@ -48,8 +48,11 @@ class VerificationConfig(_Section):
     noise_px: float = Field(
         default=0.5, gt=0, description="expected standard deviation of a key point; the matches themselves correct it"
     )
-    shared_px: float = Field(
-        default=0.1, ge=0, description="part of it that key points of one cell of an 8 x 6 grid have in common"
+    shared_share: float = Field(
+        default=0.1,
+        ge=0,
+        lt=1,
+        description="share of its variance that key points of one cell of an 8 x 6 grid are expected to have in common",
     )
     shared_depth: float = Field(
         default=0.3, ge=0, description="the same of inverse depths, as a share of their standard deviation"
@@ -62,7 +65,18 @@ class VerificationConfig(_Section):
         default=0.0005, ge=0, description="standard deviation of a loop's rotation per angle between the views"
     )
     translation_systematic: float = Field(
-        default=0.002, ge=0, description="standard deviation of a loop's translation per distance between the views"
+        default=0.005, ge=0, description="standard deviation of a loop's translation per distance between the views"
+    )
+    turn_systematic: float = Field(
+        default=0.002, ge=0, description="the same per median depth and angle between the views"
+    )
+    depth_systematic: float = Field(
+        default=0.7, ge=0, description="share of the deviation of depths by which all may be wrong alike"
+    )
+    excess_share: float = Field(
+        default=2.0,
+        ge=0,
+        description="share of what reprojection errors exceed noise_px by that the whole view may be wrong by",
     )
     locate_inliers: int = Field(default=25, ge=6, description="inliers from which a single image is localised")
     min_scale_pairs: int = Field(
@@ -91,7 +105,7 @@ class DriftConfig(_Section):
         default=0.02, gt=0, description="mono: standard deviation of log scale per root keyframe"
     )
     horizon_keyframes: int = Field(
-        default=100, ge=1, description="keyframes over which white noise shall equal the bias"
+        default=30, ge=1, description="keyframes over which white noise shall equal the bias"
     )
     floor_rotation_deg: float = Field(
         default=0.02, gt=0, description="least standard deviation of one motion's rotation"

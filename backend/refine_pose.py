@@ -2,9 +2,8 @@
 
 A match gives up to three errors: where the landmark of one camera appears in the other (two), and how its depth there
 compares with the depth that the other camera has measured (one). Each is weighed by the noise that caused it: of both
-key points, and of inverse depth, along the line on which a wrong depth moves a point. What lens, rolling shutter and
-changed perspective do to key points they do alike to neighbours; so the errors of one cell of the image share a part,
-and a hundred matches on one poster do not say a hundred times as much as one.
+key points, and of inverse depth, along the line on which a wrong depth moves a point. What many of them have in common
+no number of matches averages out: see :mod:`seamark.backend.shared_errors`.
 """
 
 from dataclasses import dataclass
@@ -13,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
+from seamark.backend.shared_errors import cells_of, excess_angle, independent_share, measured_share, systematic
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 
 Matrix = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-CELLS = (8, 6)
 STEPS = 12
 CAUCHY_WIDTH = 2.5  # standard deviations
 PRIOR_FREEDOM = 30.0
@@ -74,7 +73,7 @@ def refine(T_match_query: Matrix, seen: Observations, config: VerificationConfig
         inliers = _inliers(T, seen, sigma, config)
         if inliers.sum() < 6:
             return None
-        J, r, variance_scale = _system(T, seen, inliers, sigma, config)
+        J, r, _, _ = _system(T, seen, inliers, sigma, config)
         information = J.T @ J
         scaling = _scaling(T, seen, inliers)
         if not _well_conditioned(information, scaling):
@@ -87,16 +86,18 @@ def refine(T_match_query: Matrix, seen: Observations, config: VerificationConfig
     inliers = _inliers(T, seen, sigma, config)
     if inliers.sum() < 6:
         return None
-    J, r, variance_scale = _system(T, seen, inliers, sigma, config)
+    J, r, variance_scale, share = _system(T, seen, inliers, sigma, config)
     information, scaling = J.T @ J, _scaling(T, seen, inliers)
     if not _well_conditioned(information, scaling):
         return None
     covariance = scaling[:, None] * np.linalg.inv(information * np.outer(scaling, scaling)) * scaling * variance_scale
-    covariance += np.diag(_systematic(T, scaling[3], config) ** 2)
+    depth = float(scaling[3])
+    angle = excess_angle(variance_scale, share, seen.query.fx, config)
+    covariance += np.diag(systematic(T, depth, sigma * depth, angle, config) ** 2)
     both = np.isfinite(seen.X_query).all(axis=1) & np.isfinite(seen.X_match).all(axis=1)
     middle = float(np.median(errors(T, seen)[inliers]))
     covariance = 0.5 * (covariance + covariance.T)
-    return RefinedPose(T, covariance, inliers, middle, int((both & inliers).sum()), sigma, float(scaling[3]))
+    return RefinedPose(T, covariance, inliers, middle, int((both & inliers).sum()), sigma, depth)
 
 
 def errors(T_match_query: Matrix, seen: Observations) -> NDArray[np.float64]:
@@ -169,8 +170,9 @@ def _inliers(T: Matrix, seen: Observations, sigma: float, config: VerificationCo
 
 def _system(
     T: Matrix, seen: Observations, inliers: Flags, sigma: float, config: VerificationConfig
-) -> tuple[Matrix, NDArray[np.float64], float]:
-    """Return the whitened Jacobian (K, 6) and errors (K,) of the inliers, and their variance per assumed one.
+) -> tuple[Matrix, NDArray[np.float64], float, float]:
+    """Return the whitened Jacobian (K, 6) and errors (K,) of the inliers, their variance per assumed one and what
+    share of it neighbours have in common.
 
     The assumed variance counts like PRIOR_FREEDOM errors: few matches cannot pretend to be better than is usual.
     """
@@ -192,18 +194,22 @@ def _system(
         / p[:, 2, None, None] ** 2
     )
     deviation = sigma * np.sqrt(1 + (X[:, 2] / p[:, 2]) ** 4)
-    shared = _shared(seen.uv_query[both], seen.query, config.shared_depth**2)
-    parts.append((J / deviation[:, None, None], ((1 / p[:, 2] - 1 / Y[:, 2]) / deviation)[:, None], 1 / (1 + shared)))
+    parts.append((J / deviation[:, None, None], ((1 / p[:, 2] - 1 / Y[:, 2]) / deviation)[:, None]))
+    cells = [cells_of(seen.uv_query[in_query], seen.query), cells_of(seen.uv_match[in_match], seen.match)]
+    cells.append(cells_of(seen.uv_query[both], seen.query))
+    weights = [1 / (1 + (r**2).sum(axis=1) / CAUCHY_WIDTH**2) for _, r in parts]
+    pixels = [(r * np.sqrt(w)[:, None], w, c) for (_, r), w, c in zip(parts[:2], weights, cells, strict=False)]
+    shares = [measured_share(pixels, config.shared_share)] * 2 + [config.shared_depth**2]
     J_all, r_all = [], []
     squared, freedom = 0.0, -6.0
-    for J, r, independent in parts:
-        robust = 1 / (1 + (r**2).sum(axis=1) / CAUCHY_WIDTH**2)
+    for (J, r), robust, cell, share in zip(parts, weights, cells, shares, strict=True):
         squared += float((robust[:, None] * r**2).sum())
         freedom += float(robust.sum()) * r.shape[1]
-        weight = np.sqrt(robust * independent)
+        weight = np.sqrt(robust * independent_share(cell, share))
         J_all.append((weight[:, None, None] * J).reshape(-1, 6))
         r_all.append((weight[:, None] * r).reshape(-1))
-    return np.concatenate(J_all), np.concatenate(r_all), (PRIOR_FREEDOM + squared) / (PRIOR_FREEDOM + max(freedom, 0.0))
+    variance_scale = (PRIOR_FREEDOM + squared) / (PRIOR_FREEDOM + max(freedom, 0.0))
+    return np.concatenate(J_all), np.concatenate(r_all), variance_scale, shares[0]
 
 
 def _pixels(
@@ -216,8 +222,8 @@ def _pixels(
     other: Camera,
     sigma: float,
     config: VerificationConfig,
-) -> tuple[Matrix, Matrix, NDArray[np.float64]]:
-    """Return whitened Jacobians (K, 2, 6) and errors (K, 2), and how much (K,) of each is its own.
+) -> tuple[Matrix, Matrix]:
+    """Return whitened Jacobians (K, 2, 6) and errors (K, 2).
 
     ``X`` (K, 3) are landmarks in the other camera's frame, ``p`` in this one's, ``motion`` (K, 3, 6) is of p.
     """
@@ -234,27 +240,7 @@ def _pixels(
     across = 1 / np.sqrt(own)
     gain = 1 / np.sqrt(own + (sigma * length) ** 2) - across
     whitening = across[:, None, None] * np.eye(2) + gain[:, None, None] * unit[:, :, None] * unit[:, None, :]
-    shared = _shared(uv, camera, config.shared_px**2 / own)
-    return whitening @ projection @ motion, (whitening @ residual[:, :, None])[:, :, 0], 1 / (1 + shared)
-
-
-def _shared(uv: Matrix, camera: Camera, variance: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """Return how much (K,) the part that neighbours share adds: their number times its variance per own variance.
-
-    With n errors of variance s in a cell and a shared part of variance c their mean has variance s / n + c, which is
-    what n independent errors of variance s + n c would give.
-    """
-    cells = np.clip(uv / (camera.width, camera.height) * CELLS, 0, np.array(CELLS) - 1).astype(np.int64)
-    numbers = cells[:, 1] * CELLS[0] + cells[:, 0]
-    return np.asarray(np.bincount(numbers, minlength=CELLS[0] * CELLS[1])[numbers] * variance)
-
-
-def _systematic(T: Matrix, depth: float, config: VerificationConfig) -> NDArray[np.float64]:
-    """Return standard deviations (6,) of what no number of matches averages out: it grows with the motion."""
-    turned, moved = float(se3.rotation_angle(T[:3, :3])), float(np.linalg.norm(T[:3, 3]))
-    rotation = np.deg2rad(config.rotation_floor_deg) + config.rotation_systematic * turned
-    translation = config.translation_floor_fraction * depth + config.translation_systematic * (moved + depth * turned)
-    return np.repeat([rotation, translation], 3)
+    return whitening @ projection @ motion, (whitening @ residual[:, :, None])[:, :, 0]
 
 
 def _scaling(T: Matrix, seen: Observations, inliers: Flags) -> NDArray[np.float64]:

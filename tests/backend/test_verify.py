@@ -77,7 +77,14 @@ def test_covariance_is_that_of_the_errors(world, move, noise_px, depth_noise):
     With what neighbours share and what no number of matches averages out, which are not in this world: less.
     """
     white = VerificationConfig(
-        shared_px=0, shared_depth=0, rotation_systematic=0, translation_systematic=0, rotation_floor_deg=1e-6
+        shared_share=0,
+        shared_depth=0,
+        rotation_systematic=0,
+        translation_systematic=0,
+        turn_systematic=0,
+        depth_systematic=0,
+        excess_share=0,
+        rotation_floor_deg=1e-6,
     )
     values, cautious = [], []
     for seed in range(25):
