@@ -1,17 +1,22 @@
-"""What each ingredient of place recognition is worth, on two traverses of one way: recall, and recall without an error.
+"""What each ingredient of place recognition is worth: recall, and recall without an error.
 
-    .venv/bin/python benchmarks/places.py DATABASE QUERIES [--tolerance 3] [--signatures]
+    .venv/bin/python benchmarks/places.py DATABASE QUERIES [--tolerance 3] [--signatures] [--every 1]
+    .venv/bin/python benchmarks/places.py SOURCE [--signatures] [--every 1]
 
-DATABASE and QUERIES are folders of images; image i of one shows the place of image i of the other, so many images more
-or less. Images are taken singly, but for the last row. Columns: recall@1, @5, @10, @20, recall at full
-precision, and CPU time without looking for features, with what it takes to fill the index shared out.
+Sources are those of ``seamark places eval``, and so is the truth: poses where both have them, else the number of the
+image. A single source is asked for its own past, with the front end's odometry in rows of their own. Only every
+``--every``-th image is used. Images are taken singly, but for rows in order. Columns: recall@1, @5, @10, @20, recall
+at full precision, and CPU time without looking for features, with what it takes to fill the index shared out. Then
+the probability of the default against how many answers were right.
 ``--signatures`` adds Hamming embedding and weak geometric consistency, with directions learned from generated images.
 """
 
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from itertools import islice, pairwise, product
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,9 +25,12 @@ from numpy.typing import NDArray
 from seamark.datasets_synth.imagery import training_images
 from seamark.frontend.config import FrontendConfig
 from seamark.service import places_metrics
-from seamark.service.places_images import DescribedImage, available_workers, describe_files
-from seamark.service.places_search import search
-from seamark.service.sources.images import list_images
+from seamark.service.places_eval import EvalOptions, same_places
+from seamark.service.places_images import DescribedImage, available_workers, describe_frames
+from seamark.service.places_motion import Motion, follow
+from seamark.service.places_search import Answer, search, search_own
+from seamark.service.sources.base import Source
+from seamark.service.sources.open import open_sources
 from seamark.vocab import signatures
 from seamark.vocab.config import VocabConfig
 from seamark.vocab.inverted_index import InvertedIndex
@@ -33,6 +41,8 @@ CUES = {
     "votes": {"histogram_weight": 0.0, "view_weight": 0.0},
     "histograms": {"votes_weight": 0.0, "histogram_weight": 1.0, "view_weight": 0.0},
     "view": {"votes_weight": 0.0, "histogram_weight": 0.0, "view_weight": 1.0},
+    "votes, 2 nearest words": {"histogram_weight": 0.0, "view_weight": 0.0, "soft_words": 2},
+    "votes, 3 nearest words": {"histogram_weight": 0.0, "view_weight": 0.0, "soft_words": 3},
     "votes + histograms": {"view_weight": 0.0},
     "votes + view": {"histogram_weight": 0.0},
     "votes + histograms + view (default)": {},
@@ -41,7 +51,7 @@ Scores = NDArray[np.float64]
 Images = Sequence[DescribedImage]
 
 
-def by_cues(database: Images, queries: Images, vocabulary: Vocabulary, weights: dict[str, float]) -> Scores:
+def by_cues(database: Images, queries: Images, vocabulary: Vocabulary, weights: dict[str, Any]) -> Scores:
     index = PlaceIndex(vocabulary, VocabConfig(**weights))
     for number, image in enumerate(database):
         index.add(image.observation(number, 0))
@@ -86,7 +96,7 @@ def describe_features(image: NDArray[np.uint8], config: FrontendConfig) -> NDArr
 def report(name: str, ranked: Sequence[Sequence[int]], best: Scores, truth: NDArray[np.bool_], ms: float) -> None:
     recalls = [places_metrics.recall_at(ranked, truth, n) for n in places_metrics.RECALL_AT]
     right = np.array([truth[row, places[0]] for row, places in enumerate(ranked)])
-    full = places_metrics.recall_at_full_precision(places_metrics.curve(best, right, len(truth)))
+    full = places_metrics.recall_at_full_precision(places_metrics.curve(best, right, int(truth.any(axis=1).sum())))
     print(f"| {name} | " + " | ".join(f"{value:.3f}" for value in (*recalls, full)) + f" | {ms:.1f} |", flush=True)
 
 
@@ -96,47 +106,87 @@ def timed(work: Callable[[], Scores], queries: int) -> tuple[Scores, float]:
     return scores, 1e3 * (time.process_time() - start) / queries
 
 
+def reliability(answers: Sequence[Answer], truth: NDArray[np.bool_]) -> None:
+    print("\n| probability | answers | mean | right |\n|---|---|---|---|")
+    said = np.array([answer.probability for answer in answers])
+    right = np.array([bool(a.matches) and truth[row, a.matches[0].place] for row, a in enumerate(answers)], np.float64)
+    for low, high in pairwise((0.0, 0.5, 0.8, 0.95, 0.99, 1.0 + 1e-9)):
+        inside = (said >= low) & (said < high)
+        if inside.any():
+            mean, found = said[inside].mean(), right[inside].mean()
+            print(f"| {low:g} to {min(high, 1.0):g} | {inside.sum()} | {mean:.2f} | {found:.2f} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("database", type=Path)
-    parser.add_argument("queries", type=Path)
+    parser.add_argument("database")
+    parser.add_argument("queries", nargs="?")
     parser.add_argument("--tolerance", type=int, default=3)
+    parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--vocab", type=Path)
     parser.add_argument("--signatures", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     vocabulary = Vocabulary.load(options.vocab) if options.vocab else Vocabulary.default()
-    config, workers = FrontendConfig(), available_workers()
-    database, queries = (
-        describe_files(list_images(folder), config, workers) for folder in (options.database, options.queries)
-    )
-    truth = np.abs(np.arange(len(queries))[:, None] - np.arange(len(database))[None]) <= options.tolerance
-    print(f"{vocabulary.n_words} words, {len(database)} places, {len(queries)} queries, +-{options.tolerance} images\n")
+    config, workers, own = FrontendConfig(), available_workers(), options.queries is None
+    first = open_sources([options.database], mode=None if own else "places")
+    second = first if own else open_sources([options.queries], mode="places")
+    asked = EvalOptions(Path(), tolerance_images=options.tolerance)
+    truth, judged, said = same_places(first, second, asked, own=own)
+
+    def described(source: Source) -> list[DescribedImage]:
+        chosen = islice(source.frames(), 0, None, options.every)
+        return describe_frames(chosen, source.n_frames, config, workers)
+
+    database = described(first)
+    queries = database if own else described(second)
+    truth, judged = truth[:: options.every, :: options.every], judged[:: options.every]
+    eligible, motion, stamps = np.ones(truth.shape, np.bool_), None, []
+    if own:
+        assert first.stamps_ns is not None
+        stamps = first.stamps_ns[:: options.every].tolist()
+        settings = VocabConfig()
+        if first.period_ns >= 10**9:
+            settings = VocabConfig(exclude_recent_s=0.0, exclude_recent_count=settings.exclude_recent_count_places)
+        followed = follow(first, config)
+        if followed is not None:
+            motion = Motion(followed.T_odom_cam[:: options.every], followed.sessions[:: options.every], followed.metric)
+        arguments: dict[str, Any] = {"top": 20, "in_order": False, "workers": 1}
+        _, eligible = search_own(database, stamps, vocabulary, settings, **arguments)
+    truth = truth & eligible
+    rows = np.flatnonzero(judged & eligible.any(axis=1))
+    print(f"{len(database)} places, {len(rows)} queries, {int(truth[rows].any(axis=1).sum())} with a place; {said}\n")
     print("| | @1 | @5 | @10 | @20 | full precision | CPU ms per query |\n|---|---|---|---|---|---|---|")
 
-    def ranked(scores: Scores) -> list[list[int]]:
-        return [np.argsort(-row, kind="stable")[: max(places_metrics.RECALL_AT)].tolist() for row in scores]
+    def matrix(name: str, work: Callable[[], Scores]) -> None:
+        scores, ms = timed(work, len(queries))
+        scores = np.where(eligible, scores, -np.inf)[rows]
+        ranked = [np.argsort(-row, kind="stable")[: max(places_metrics.RECALL_AT)].tolist() for row in scores]
+        report(name, ranked, scores.max(axis=1), truth[rows], ms)
 
     for name, weights in CUES.items():
-        scores, ms = timed(lambda weights=weights: by_cues(database, queries, vocabulary, weights), len(queries))
-        report(name, ranked(scores), scores.max(axis=1), truth, ms)
-    for with_geometry in (False, True) if options.signatures else ():
-        scores, ms = timed(
-            lambda geometry=with_geometry: by_signatures(database, queries, vocabulary, with_geometry=geometry),
-            len(queries),
-        )
-        name = "votes with signatures" + (", orientation and scale" if with_geometry else "")
-        report(name, ranked(scores), scores.max(axis=1), truth, ms)
-    for name, in_order in (("default + verification of 20", False), ("default in order (--sequence)", True)):
+        matrix(name, lambda weights=weights: by_cues(database, queries, vocabulary, weights))
+    for geometry in (False, True) if options.signatures else ():
+        name = "votes with signatures" + (", orientation and scale" if geometry else "")
+        matrix(name, lambda g=geometry: by_signatures(database, queries, vocabulary, with_geometry=g))
+    for by, in_order in product((None, motion) if motion else (None,), (False, True)):
         start = time.process_time()
-        answers = search(database, queries, vocabulary, VocabConfig(), top=20, in_order=in_order, workers=1)
+        arguments = {"top": 20, "in_order": in_order, "workers": 1}
+        if own:
+            answers, _ = search_own(database, stamps, vocabulary, settings, **arguments, motion=by)
+        else:
+            answers = search(database, queries, vocabulary, VocabConfig(), **arguments)
         ms = 1e3 * (time.process_time() - start) / len(queries)
+        answers = [answers[row] for row in rows]
         places = [[match.place for match in answer.matches] for answer in answers]
-        if not in_order:
-            evidence = np.array([answer.evidence for answer in answers])
-            report(name, places, evidence, truth, ms)
+        name = ("in order" if in_order else "verification of 20") + (", odometry" if by else "")
+        if not in_order and not by:
+            report(name, places, np.array([answer.evidence for answer in answers]), truth[rows], ms)
             name += ", less doubt (places match)"
-        report(name, places, np.array([answer.matches[0].score for answer in answers]), truth, ms)
+        report(name, places, np.array([answer.matches[0].score for answer in answers]), truth[rows], ms)
+        if not in_order and by is motion:
+            singly = answers
+    reliability(singly, truth[rows])
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ def evaluate_places(
     Writes matches.csv, precision_recall.csv, places_eval.json and places_eval.png into ``options.out`` and returns what
     the JSON holds. Raises EvaluationError where nothing tells which images show the same place.
     """
-    truth = _truth(source, source if against is None else against, options, own=against is None)
+    truth = same_places(source, source if against is None else against, options, own=against is None)
     vocabulary = Vocabulary.default() if options.vocabulary is None else Vocabulary.load(options.vocabulary)
     with prepare_output(options.out) as output:
         database = _describe(source, config, workers, warn, progress)
@@ -169,7 +169,7 @@ def report_table(report: dict[str, Any]) -> Table:
     return table
 
 
-def _truth(
+def same_places(
     source: Source, queries: Source, options: EvalOptions, *, own: bool
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], str]:
     """Return which places each query shows (queries, places), for which queries that is known, and by what."""

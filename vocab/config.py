@@ -48,6 +48,12 @@ class VocabConfig(BaseModel):
     trusted_features: int = Field(
         default=200, ge=1, description="With fewer features than this an image's votes count proportionally less."
     )
+    soft_words: int = Field(
+        default=1,
+        ge=1,
+        le=8,
+        description="A query's features vote for so many words each, the nearest ones; places keep the nearest alone.",
+    )
     signatures: bool = Field(
         default=False,
         description="Keep 64 bits of each feature, so that only features alike within a word vote; 8 bytes more each.",
@@ -64,4 +70,6 @@ class VocabConfig(BaseModel):
     def _some_cue_counts(self) -> Self:
         if self.votes_weight + self.histogram_weight + self.view_weight <= 0.0:
             raise ValueError("votes_weight, histogram_weight and view_weight must not all be 0")
+        if self.signatures and self.soft_words > 1:
+            raise ValueError("signatures belong to the nearest word: soft_words must be 1 with them")
         return self

@@ -154,6 +154,8 @@ def load(path: Path) -> IndexFile:
     Raises:
         IndexFileError: the file is missing, damaged, or of an unknown version.
     """
+    if path.exists() and not path.is_file():  # to open a named pipe would wait for ever
+        raise IndexFileError(f"{path}: cannot read the place index: it is no file")
     try:
         with path.open("rb") as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

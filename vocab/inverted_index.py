@@ -94,17 +94,19 @@ class InvertedIndex:
         each = np.repeat(codes, count).astype(np.uint8)
         return self._postings.add(words[order], each, mass, _sorted(signatures, order), _sorted(geometry, order))
 
-    def votes(self, words: NDArray[np.int32]) -> NDArray[np.float32]:
+    def votes(self, words: NDArray[np.int32], nearest: NDArray[np.int32] | None = None) -> NDArray[np.float32]:
         """Return the similarity, 0..1, of an image that shows ``words`` (N,) int32 to the place in each slot.
 
-        The result is (n_slots,) float32; the slots of removed places hold 0.
+        The result is (n_slots,) float32; the slots of removed places hold 0. Where ``words`` are several for each
+        descriptor (soft assignment), ``nearest`` are the words that count as what the image shows.
 
         Raises:
             ObservationError: a word that is not in the vocabulary.
         """
         self._check(words, None, None, False, False)
         present, count = _counted(words)
-        most, mass = np.sqrt(count).astype(np.float32), self._mass(present, count)
+        most = np.sqrt(count).astype(np.float32)
+        mass = self._mass(present, count) if nearest is None else self._mass(*_counted(nearest))
         return self._postings.votes(present, self._idf[present], most, mass)
 
     def near_votes(

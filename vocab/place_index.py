@@ -203,10 +203,11 @@ class PlaceIndex:
         bins, sigma_bins = self.config.histogram_bins, self.config.histogram_sigma_bins
         histograms = histogram.describe(observation.thumbnail, bins, sigma_bins)
         descriptors = observation.descriptors[: self.config.max_descriptors]
-        words, signed = self.vocabulary.assign(descriptors), None
+        nearest, _ = self.vocabulary.assign_soft(descriptors, self.config.soft_words)
+        words, signed = np.ascontiguousarray(nearest[:, 0]), None
         if self._directions is not None:
             signed = signatures.sign(descriptors, self.vocabulary.words, words, self._directions)
-        return _Looks(words, signed, histograms, view.describe(observation.thumbnail))
+        return _Looks(words, nearest[nearest >= 0], signed, histograms, view.describe(observation.thumbnail))
 
     def _insert(self, observation: PlaceObservation, looks: "_Looks") -> None:
         with self._changing:
@@ -248,7 +249,7 @@ class PlaceIndex:
 
     def _votes(self, looks: "_Looks") -> NDArray[np.float32]:
         if looks.signatures is None:
-            return self._inverted.votes(looks.words)
+            return self._inverted.votes(looks.soft_words, looks.words)
         return self._inverted.near_votes(looks.words, looks.signatures, NEAR_VOTES)
 
     def _fuse(
@@ -284,6 +285,7 @@ class _Looks:
     """What the index compares of an image."""
 
     words: NDArray[np.int32]
+    soft_words: NDArray[np.int32]  # with soft assignment several of each feature
     signatures: NDArray[np.uint64] | None
     histograms: Histograms
     view: View

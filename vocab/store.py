@@ -65,6 +65,8 @@ def read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     Raises:
         VocabularyFileError: the file is missing, damaged, or of an unknown version.
     """
+    if path.exists() and not path.is_file():  # to open a named pipe would wait for ever
+        raise VocabularyFileError(f"{path}: cannot read the vocabulary: it is no file")
     try:
         with path.open("rb") as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

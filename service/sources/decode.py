@@ -1,6 +1,7 @@
 """Image files to arrays, with every way in which a file can be broken told apart."""
 
 import re
+import stat
 import zlib
 from pathlib import Path
 
@@ -129,6 +130,8 @@ def _check_png(data: bytes, name: str) -> None:
 
 def _decode(path: Path) -> NDArray[np.generic]:
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # to open a named pipe would wait for ever
+            raise UnreadableImageError(f"{path.name} is no file")
         data = path.read_bytes()
     except FileNotFoundError as error:
         raise UnreadableImageError(f"{path.name} is missing") from error

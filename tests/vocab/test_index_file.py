@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import struct
 import threading
 from pathlib import Path
@@ -246,3 +247,10 @@ def test_removing_most_places_gives_their_room_back() -> None:
     for number in range(290):
         index.add(observe(number))
     assert len(index) == 300
+
+
+def test_a_named_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.places"
+    os.mkfifo(pipe)
+    with pytest.raises(IndexFileError, match="no file"):
+        PlaceIndex.load(pipe, VOCABULARY)

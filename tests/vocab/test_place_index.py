@@ -277,3 +277,29 @@ def test_two_indices_with_one_history_answer_alike(vocabulary: Vocabulary) -> No
 def test_some_cue_must_count() -> None:
     with pytest.raises(ValidationError, match="must not all be 0"):
         VocabConfig(votes_weight=0, histogram_weight=0, view_weight=0)
+
+
+def test_soft_assignment_finds_features_that_fell_into_a_neighbouring_word() -> None:
+    """Test: words come in pairs so near that noise decides between both. Expected: with two words each nothing is lost.
+
+    The likeness is that of equal images again, since what an image shows is counted by its nearest words.
+    """
+    rng = np.random.default_rng(3)
+    one = rng.integers(20, 230, (200, 128))
+    apart = rng.choice([-2, 2], one.shape)
+    words = np.concatenate([one - apart, one + apart]).astype(np.uint8)
+    pairs = Vocabulary(words, np.ones(400, np.float32))
+
+    def look(key: int, session: int) -> PlaceObservation:
+        seen = np.clip(one[:60] + rng.integers(-9, 10, (60, 128)), 0, 255).astype(np.uint8)
+        return PlaceObservation(key, session, 0, seen, np.zeros((60, 2), np.float32), np.zeros((4, 4), np.uint8))
+
+    votes = []
+    for soft_words in (1, 2):
+        index = PlaceIndex(pairs, VocabConfig(soft_words=soft_words))
+        index.add(look(0, 0))
+        votes.append(index.query(look(1, 1)).ranked[0].votes)
+    assert 0.3 < votes[0] < 0.8  # half of the features fall into the other word of their pair
+    assert votes[1] == pytest.approx(1.0, abs=1e-6)
+    with pytest.raises(ValidationError, match="nearest word"):
+        VocabConfig(soft_words=2, signatures=True)

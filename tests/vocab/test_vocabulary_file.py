@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import struct
 from pathlib import Path
 
@@ -180,3 +181,10 @@ def test_a_vocabulary_whose_weights_make_no_sense_is_refused(path: Path, vocabul
     store.write(path, {"words": vocabulary.words, "idf": np.zeros(37, np.float32)}, {})
     with pytest.raises(VocabularyFileError, match=r"some\.vocab"):
         Vocabulary.load(path)
+
+
+def test_a_named_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.vocab"
+    os.mkfifo(pipe)
+    with pytest.raises(VocabularyFileError, match="no file"):
+        Vocabulary.load(pipe)
