@@ -1,8 +1,7 @@
-"""The front end alone, against ground truth: accuracy, honesty of its covariance, what each ingredient earns.
+"""The front end alone, against ground truth: accuracy and honesty of its covariance.
 
     .venv/bin/python benchmarks/frontend.py DATA [NAME...]              the real sequences
     .venv/bin/python benchmarks/frontend.py DATA --worlds [NAME...]     rendered loops of 60 m and more, 3 seeds
-    .venv/bin/python benchmarks/frontend.py DATA --ablation             the real sequences, one ingredient off at a time
 
 DATA is the folder with the real sequences. ATE and RPE are of the poses as given at the frame, of the longest session,
 after SE(3) alignment, Sim(3) for mono. NEES is the squared error of the motion since the reference keyframe, over its
@@ -13,18 +12,16 @@ bound. One process, one thread of OpenCV and BLAS besides that of the keyframes.
 import argparse
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.frontend import odometry, se3, session, tracker
+from seamark.frontend import se3
 from seamark.frontend.config import FrontendConfig
-from seamark.frontend.flow import track as follow_flow
 from seamark.frontend.odometry import Frontend
 from seamark.frontend.types import Mode, Odometry
 from seamark.service.evaluation import Alignment, associate, ate, rpe
@@ -124,34 +121,6 @@ def honesty(posed: list[Odometry], truth: Trajectory, scale: float) -> NDArray[n
     return np.array(errors)
 
 
-def without_return_check(*args: Any, **settings: Any) -> Any:
-    return follow_flow(*args, **{**settings, "round_trip_px": 1e6})
-
-
-ABLATIONS: dict[str, tuple[dict[str, Any], list[tuple[Any, str, Callable[..., Any]]]]] = {
-    "all on": ({}, []),
-    "window off": ({}, [(session.Session, "adjust_window", lambda self: None)]),
-    "re-observation off": ({"revisit_keyframes": 0}, []),
-    "settling on keyframe patches off": ({}, [(odometry.tracker, "settle", lambda s, grey, tracks, T: tracks)]),
-    "descriptor fallback off": ({}, [(odometry, "recover", lambda *a: None)]),
-    "return check of flow off": ({}, [(tracker.flow, "track", without_return_check)]),
-    "motion prior of flow off": ({}, [(tracker, "predict_pixels", lambda s, tracks: tracks.pixels)]),
-    "presumed distances off": ({}, [(session.Session, "_landmarks_presumed", lambda self: None)]),
-    "disparity offset off": ({"disparity_systematic_px": 0.0}, []),
-}
-
-
-def ablations(data: Path) -> Iterator[str]:
-    for label, (settings, replacements) in ABLATIONS.items():
-        kept = [(owner, name, getattr(owner, name)) for owner, name, _ in replacements]
-        for owner, name, stand_in in replacements:
-            setattr(owner, name, stand_in)
-        for name, (folder, mode) in REAL.items():
-            yield row(f"{label}: {name}", run(str(data / folder), mode, FrontendConfig(**settings)))
-        for owner, name, original in kept:
-            setattr(owner, name, original)
-
-
 def worlds(names: list[str]) -> Iterator[str]:
     for place in PLACES:
         for mode in ("rgbd", "stereo", "mono"):
@@ -172,12 +141,11 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--worlds", action="store_true")
-    parser.add_argument("--ablation", action="store_true")
     wish = parser.parse_intermixed_args()
     cv2.setNumThreads(1)
     print(f"| {COLUMNS} |")
     print("|" + "---|" * len(COLUMNS.split("|")))
-    rows = ablations(wish.data) if wish.ablation else worlds(wish.names) if wish.worlds else real(wish.data, wish.names)
+    rows = worlds(wish.names) if wish.worlds else real(wish.data, wish.names)
     for line in rows:
         print(f"| {line} |", flush=True)
 

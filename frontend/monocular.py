@@ -9,12 +9,13 @@ from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import grey_of
+from seamark.frontend.first_map import first_map
 from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.pose import estimate_pose
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
 from seamark.frontend.tracks import Tracks, shared
-from seamark.frontend.two_view import TwoView, initialise
+from seamark.frontend.two_view import TwoView
 from seamark.frontend.types import Filled, Frame
 
 MAX_VIEWS = 400
@@ -63,18 +64,29 @@ class MonoInitialiser:
             self.refusal = "little_motion"
             return None
         c = self.config
-        result = initialise(
+        result = first_map(
             first.pixels[i],
             newest.pixels[j],
             self.camera,
             min_parallax_px=c.initial_parallax_px,
             min_landmarks=c.initial_min_landmarks,
             min_angle_deg=c.triangulation_min_angle_deg,
+            pixels_between=self._between(ids),
         )
         if isinstance(result, str):
             self.refusal = result
             return None
         return result, ids
+
+    def _between(self, ids: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Return where tracks (N,) were seen halfway, (N, 2), NaN where they were not; None where there is no view."""
+        if len(self.views) < 3:
+            return None
+        halfway = self.views[len(self.views) // 2]
+        pixels = np.full((len(ids), 2), np.nan)
+        i, j = shared(ids, halfway.tracks.ids)
+        pixels[i] = halfway.pixels[j]
+        return pixels
 
     def fill(self, session: Session, keyframe_id: int, T_odom_first: NDArray[np.float64]) -> tuple[Filled, ...]:
         """Give the views between the first and the newest their poses against the new landmarks."""

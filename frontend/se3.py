@@ -116,6 +116,5 @@ def orthonormalise(T: Matrix) -> Matrix:
     out = np.array(T, np.float64)
     R = out[..., :3, :3]
     for _ in range(POLAR_ITERATIONS):
-        excess = np.einsum("...ki,...kj->...ij", R, R) - np.eye(3)
-        R -= 0.5 * np.einsum("...ik,...kj->...ij", R, excess)
+        R[...] = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)
     return out

@@ -1,15 +1,11 @@
-"""Two views of a moving camera: relative pose, parallax and triangulation."""
+"""Two views of a moving camera: parallax and triangulation; first_map.py has the motion between them."""
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.frontend import se3
 from seamark.frontend.camera import Camera
-
-ESSENTIAL_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,47 +59,6 @@ def rotation_compensated_parallax(
     turned = rays_second @ R_first_second.T
     turned[:, 2] = np.maximum(turned[:, 2], 1e-3)
     return np.linalg.norm(camera.project_ideal(turned) - pixels_first, axis=1)
-
-
-def initialise(
-    pixels_first: NDArray[np.float64],
-    pixels_second: NDArray[np.float64],
-    camera: Camera,
-    *,
-    min_parallax_px: float,
-    min_landmarks: int,
-    min_angle_deg: float,
-) -> TwoView | str:
-    """Build a first map from two views, or say in a word why it is not yet safe.
-
-    Ideal pixels (N, 2) of the same corners. An essential matrix (MAGSAC++, Barath 2020) gives the motion; it is
-    refused for little parallax after the rotation is taken out (pure rotation), for few points in front of both
-    cameras or with a wide enough angle. The median depth becomes 1.
-    """
-    if len(pixels_first) < min_landmarks:
-        return "few_tracks"
-    E, mask = cv2.findEssentialMat(
-        pixels_first, pixels_second, camera.K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=ESSENTIAL_PX
-    )
-    if E is None or E.shape != (3, 3) or mask is None:
-        return "no_essential_matrix"
-    inliers = mask.reshape(-1).astype(bool)
-    if inliers.sum() < min_landmarks:
-        return "few_inliers"
-    _, R, t, _ = cv2.recoverPose(E, pixels_first, pixels_second, camera.K, mask=mask.copy())
-    T_first_second = se3.inverse(se3.make(R, t))
-    rays_first = normalised_rays(pixels_first, camera)
-    rays_second = normalised_rays(pixels_second, camera)
-    parallax = rotation_compensated_parallax(T_first_second[:3, :3], pixels_first, rays_second, camera)
-    if float(np.median(parallax[inliers])) < min_parallax_px:
-        return "little_parallax"
-    points, angle = triangulate(np.eye(4), rays_first, T_first_second, rays_second)
-    good = inliers & np.isfinite(points[:, 0]) & (angle > np.deg2rad(min_angle_deg))
-    if good.sum() < max(min_landmarks, 0.5 * inliers.sum()):
-        return "few_landmarks"
-    scale = 1 / float(np.median(points[good, 2]))
-    T_first_second[:3, 3] *= scale
-    return TwoView(T_first_second, np.where(good[:, None], points * scale, np.nan))
 
 
 def normalised_rays(pixels: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
