@@ -31,13 +31,15 @@ class MapFile:
 
     A writer has the file for itself; one of an older version is brought up to date. Readers come in any number, also
     while a writer is at work. While nobody writes, a reader leaves the folder as it was, to the byte. ``database`` is
-    used inside of ``reading`` and ``writing`` only.
+    used inside of ``reading`` and ``writing`` only. A reader ``beside_writer`` never keeps a writer from coming, and
+    leaves SQLite's files in the folder.
 
     Raises MapInUseError for a second writer, MapVersionError for a file that is no map or of another version,
     MapCorruptError for damage, MapUnwritableError for what the disk refuses, MapError for the rest.
     """
 
-    def __init__(self, path: Path, read_only: bool = False) -> None:
+    def __init__(self, path: Path, read_only: bool = False, beside_writer: bool = False) -> None:
+        self._beside_writer = beside_writer
         self.path = path
         self.read_only = read_only
         self._lock = threading.RLock()
@@ -115,6 +117,8 @@ class MapFile:
 
     def _claimed(self) -> MapLock | None:
         """Lock the file, which is made if it is missing."""
+        if self.read_only and self._beside_writer:
+            return None
         if self.read_only:
             return MapLock(self.path, exclusive=False)
         if not self.path.exists():

@@ -68,9 +68,9 @@ class MapStore:
     :class:`~seamark.backend.map_file.MapFile`, and MapCorruptError for damage found by a checksum.
     """
 
-    def __init__(self, path: Path, read_only: bool = False) -> None:
+    def __init__(self, path: Path, read_only: bool = False, beside_writer: bool = False) -> None:
         self.path = path
-        self.file = MapFile(path, read_only)
+        self.file = MapFile(path, read_only, beside_writer)
         self._cameras: dict[int, Camera] = {}
         self._written: dict[int, tuple[NDArray[np.float64], float]] = {}  # poses as they are in the file
 

@@ -28,6 +28,7 @@ from seamark.service.zenoh_session import SessionError, Watch, free_endpoint, op
 logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 60.0
+RESTORE_TIMEOUT_S = 1800.0  # a large map without a place index beside it is described anew; who dies is noticed
 STOP_TIMEOUT_S = 4.5  # for all nodes together
 # Until when each node may take its time, so that those behind it have theirs; what has not ended then is killed.
 STOP_SHARES = {FRONTEND: 0.45, VOCAB: 0.6, BACKEND: 1.0}
@@ -177,7 +178,7 @@ class Launcher:
             with self._lock:
                 self._start(name, self._settings)
         if self._settings.restore:
-            self._watch.wait_for((BACKEND, VOCAB), START_TIMEOUT_S, self.check)
+            self._watch.wait_for((BACKEND, VOCAB), RESTORE_TIMEOUT_S, self.check)
             self._counting_on()
         with self._lock:
             self._start(FRONTEND, self._settings)

@@ -1,10 +1,13 @@
 """The vocabulary as a node: keyframes in, ranked places out."""
 
+import contextlib
 import logging
 import sys
 import threading
 from concurrent.futures import Future
+from pathlib import Path
 
+from seamark.backend.errors import MapError
 from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Keyframe
 from seamark.service import topics
@@ -97,6 +100,14 @@ class VocabNode:
         return Done(self._bus.node)
 
 
+def _reader(path: Path, localise_only: bool) -> MapStore:
+    """Open the map, which the back end is about to write: describing a large one must not keep it from that."""
+    if not localise_only:
+        with contextlib.suppress(MapError):  # a disk that takes nothing has no room for SQLite's files either
+            return MapStore(path, read_only=True, beside_writer=True)
+    return MapStore(path, read_only=True)
+
+
 def build(bus: Bus, settings: NodeSettings) -> VocabNode:
     """Return the node for the settings; raises VocabularyFileError, MapError."""
     path = settings.vocabulary
@@ -105,7 +116,7 @@ def build(bus: Bus, settings: NodeSettings) -> VocabNode:
         return VocabNode(bus, PlaceIndex(vocabulary, settings.config.vocab))
     index, described = PlaceIndex(vocabulary, settings.config.vocab), 0
     if settings.restore:
-        with MapStore(settings.map_path, read_only=True) as store:
+        with _reader(settings.map_path, settings.localise_only) as store:
             index, described = open_index(store, vocabulary, settings.config.vocab)
     meter = Meter(bus.node)
     meter.keep("places_described_at_start", described)

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from seamark.backend.errors import MapCorruptError, MapError, MapVersionError
+from seamark.backend.errors import MapCorruptError, MapError, MapInUseError, MapVersionError
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
 
@@ -125,3 +125,18 @@ def test_a_full_disk_is_an_error_and_keeps_what_was_there(tmp_path, keyframe):
         assert_same(keyframe(0), store.keyframe(0))
     with MapStore(path, read_only=True) as store:
         assert_same(keyframe(0), next(iter(store.load_keyframes())))
+
+
+def test_a_reader_beside_the_writer_keeps_nobody_out_and_sees_what_is_written(tmp_path, keyframe):
+    path = tmp_path / "map.seamark"
+    with MapStore(path) as store:
+        store.add_keyframe(keyframe(0))
+    with MapStore(path, read_only=True), pytest.raises(MapInUseError):
+        MapStore(path)
+    with MapStore(path, read_only=True, beside_writer=True) as reader, MapStore(path) as writer:
+        writer.add_keyframe(keyframe(1))
+        assert reader.keyframe_ids() == [0, 1]
+        with pytest.raises(MapError):
+            reader.add_keyframe(keyframe(2))
+    with MapStore(path, read_only=True) as reader:
+        assert reader.keyframe_ids() == [0, 1]
