@@ -6,7 +6,6 @@ odometry and loops as in Mangelsen et al. (ICRA 2018), along the shortest way th
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 from math import gamma
 from typing import Final
 
@@ -18,31 +17,17 @@ from seamark.backend.config import ConsistencyConfig
 from seamark.backend.consistency import greedy_clique, pair_chi2
 from seamark.backend.graph_types import Constraint
 from seamark.backend.ledger import Finding
+from seamark.backend.loop_groups import Group, near_pairs
 from seamark.backend.step_table import StepTable
 from seamark.backend.types import Reason
 from seamark.backend.ways import ALL_AXES, LOOP_STEPS, PLANAR_AXES, Way, Ways
 
 # A way that leaves less than this of the volume that odometry alone leaves has something of its own to say.
 TELLING_VOLUME: Final = 0.1
+# So many findings are compared with their neighbours at once: more would only take memory.
+JOINED_AT_ONCE: Final = 200
 # A map is taken to be at least so wide, high and deep, in its own units.
 LEAST_SIDE: Final = 1.0
-
-
-@dataclass(eq=False)
-class Group:
-    """Loops near to each other that agree: one observation of one place, however often it was made.
-
-    ``middle`` is the finding that speaks for it, ``odometry`` its way through odometry alone, None where there is none.
-    """
-
-    number: int
-    members: list[int] = field(default_factory=list)
-    accepted: bool = False
-    contradicted: bool = False  # by the way through what is accepted
-    contested: bool = False  # by a group of comparable weight, which is left out as well
-    middle: int = 0
-    weight: float = 0.0
-    odometry: Way | None = None
 
 
 class PoseJudge:
@@ -70,7 +55,7 @@ class PoseJudge:
     def enter(self, findings: Sequence[Finding]) -> Mapping[int, Reason]:
         """See :class:`~seamark.backend.ledger.Judge`."""
         before = {number: self._verdict(group) for number, group in self._groups.items()}
-        joined = {self._join(finding) for finding in findings}
+        joined = set(self._join_all(findings))
         entered = [self._groups[number] for number in sorted(joined) if number in self._groups]
         for group in entered:
             self._describe(group)
@@ -88,7 +73,7 @@ class PoseJudge:
 
     def restore(self, finding: Finding) -> None:
         """See :class:`~seamark.backend.ledger.Judge`."""
-        group = self._groups[self._join(finding)]
+        group = self._groups[self._join_all([finding])[0]]
         group.accepted = True
         self._describe(group)
 
@@ -102,19 +87,37 @@ class PoseJudge:
         assert constraint is not None
         return constraint
 
-    def _join(self, finding: Finding) -> int:
-        """Put a finding into the group it belongs to, which may join groups; return the group's number."""
-        number = len(self._findings)
-        others, apart = self._neighbours(finding)
-        self._findings.append(finding)
+    def _join_all(self, findings: Sequence[Finding]) -> list[int]:
+        """Put findings into the groups they belong to; return the group's number of each as it joined.
+
+        Which neighbours agree is worked out for many findings in one go.
+        """
+        numbers, joined = [], []
+        near: list[tuple[list[int], NDArray[np.int64]]] = []
+        for finding in findings:
+            near.append(self._neighbours(finding))
+            numbers.append(len(self._findings))
+            self._findings.append(finding)
+        for first in range(0, len(findings), JOINED_AT_ONCE):
+            part = slice(first, first + JOINED_AT_ONCE)
+            ones = [
+                self._constraint(n) for n, (others, _) in zip(numbers[part], near[part], strict=True) for _ in others
+            ]
+            loops = [self._constraint(other) for others, _ in near[part] for other in others]
+            chi2 = pair_chi2(ones, loops, self._chains)[0] if loops else np.zeros(0)
+            agrees = (chi2 <= self._config.pair_chi2).tolist()
+            for number, (others, apart) in zip(numbers[part], near[part], strict=True):
+                joined.append(self._join(number, others, apart, agrees[: len(others)]))
+                agrees = agrees[len(others) :]
+        return joined
+
+    def _join(self, number: int, others: list[int], apart: NDArray[np.int64], agrees: Sequence[bool]) -> int:
+        """Put a finding into the group that most of its neighbours there agree with, which may join groups."""
         self._group_of.append(number)
         group = self._groups[number] = Group(number, [number])
         votes: dict[int, int] = {}
-        if others:
-            loops = [self._constraint(other) for other in others]
-            chi2, _ = pair_chi2([self._constraint(number)] * len(loops), loops, self._chains)
-            for other, agrees in zip(others, (chi2 <= self._config.pair_chi2).tolist(), strict=True):
-                votes[self._group_of[other]] = votes.get(self._group_of[other], 0) + (1 if agrees else -1)
+        for other, agreed in zip(others, agrees, strict=True):
+            votes[self._group_of[other]] = votes.get(self._group_of[other], 0) + (1 if agreed else -1)
         for other_group in sorted(k for k, vote in votes.items() if vote > 0):
             group = self._merge(self._groups[other_group], group)
         # Ways need no loop that runs beside another one of its group through which they lead.
@@ -285,7 +288,11 @@ class PoseJudge:
         agree = np.ones((len(groups), len(groups)), bool)
         middles = [group.middle for group in groups]
         sessions = [self._findings[number].sessions for number in middles]
-        pairs = [(i, j) for i, j in self._near_pairs(middles) if sessions[i] == sessions[j]]
+        pairs = [
+            (i, j)
+            for i, j in near_pairs([self._findings[number].key for number in middles], self._config.compared_loops)
+            if sessions[i] == sessions[j]
+        ]
         unknown = [(i, j) for i, j in pairs if (middles[i], middles[j]) not in self._agree]
         if unknown:
             ones, others = ([self._constraint(middles[pair[k]]) for pair in unknown] for k in (0, 1))
@@ -295,13 +302,3 @@ class PoseJudge:
         for i, j in pairs:
             agree[i, j] = agree[j, i] = self._agree[middles[i], middles[j]]
         return agree
-
-    def _near_pairs(self, middles: Sequence[int]) -> list[tuple[int, int]]:
-        """Return pairs i > j, each group with the nearest ones only: odometry says little of those far away."""
-        keys = np.array([self._findings[number].key for number in middles]).reshape(-1, 2)
-        pairs: set[tuple[int, int]] = set()
-        for i in range(1, len(keys)):
-            distances = np.abs(keys[:i] - keys[i]).sum(axis=1)
-            nearest = np.argsort(distances, kind="stable")[: self._config.compared_loops]
-            pairs |= {(i, j) for j in nearest.tolist()}
-        return sorted(pairs)
