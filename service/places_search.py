@@ -162,6 +162,8 @@ def _answers(
             score |= {place: score[place] + SUPPORT_WEIGHT * found.support for place, found in verified.items()}
         ranked = sorted(score, key=lambda place: (-score[place], place))
         off = 0.0 if in_order else confidence.doubt([score[place] for place in ranked[:VERIFIED]])
+        if not in_order and ranked and verified[ranked[0]].inliers < confidence.MIN_INLIERS:
+            off += confidence.FEW_INLIERS_DOUBT
         matches = [_match(table, row, place, score[place] - off, verified.get(place)) for place in ranked[:top]]
         decided = _decide(queries[row], matches, score[ranked[0]] if ranked else 0.0, in_order)
         return decided if motion is None else _heed(decided, row, motion)

@@ -10,6 +10,8 @@ ACCEPTED_FROM: Final = 0.95
 """An answer at least so probable is accepted."""
 
 MIN_INLIERS: Final = 8  # unrelated images share up to seven
+FEW_INLIERS_DOUBT: Final = 1.0
+"""Taken off the scores of a query whose best place has fewer: what is refused ranks below what may be accepted."""
 
 
 DOUBT_WEIGHT: Final = 0.4
