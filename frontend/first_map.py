@@ -19,6 +19,7 @@ ESSENTIAL_PX = 1.0
 HOMOGRAPHY_PX = 1.5
 CHI2_1DOF_95, CHI2_2DOF_95 = 3.84, 5.99
 PLANE_SHARE = 0.45  # of the two scores together: from here on the homography is taken
+ALL_BUT_A_FEW = 0.95  # of what fits the essential matrix lies in the plane: what does not would decide between motions
 RIVAL_SHARE = 0.75  # of the landmarks of the best motion: with so many another one is a rival
 DECISIVE = 0.75  # of the rival's error in the third view: the right motion stays below
 THIRD_VIEW_PX = 1.5
@@ -84,12 +85,14 @@ def _motions(pixels_first: Array, pixels_second: Array, camera: Camera) -> _Moti
     )
     if E is None or E.shape != (3, 3) or mask is None:
         return None
+    inliers = mask.reshape(-1).astype(bool)
     H, _ = cv2.findHomography(pixels_first, pixels_second, cv2.USAC_MAGSAC, HOMOGRAPHY_PX, confidence=0.999)
     if H is not None:
         by_plane, on_plane = _homography_score(H, pixels_first, pixels_second)
-        if by_plane > PLANE_SHARE * (by_plane + _essential_score(E, pixels_first, pixels_second, camera)):
+        all_in_plane = on_plane[inliers].sum() >= ALL_BUT_A_FEW * inliers.sum()
+        by_epipole = _essential_score(E, pixels_first, pixels_second, camera)
+        if all_in_plane and by_plane > PLANE_SHARE * (by_plane + by_epipole):
             return _Motions(_plane_motions(H, camera), on_plane)
-    inliers = mask.reshape(-1).astype(bool)
     _, R, t, _ = cv2.recoverPose(E, pixels_first, pixels_second, camera.K, mask=mask.copy())
     return _Motions([se3.inverse(se3.make(R, t))], inliers)
 
