@@ -239,12 +239,13 @@ def service(folder: Path, count: int) -> dict[str, object]:
     query = PlaceQuery(bytes(cv2.imencode(".png", picture)[1]))
     rows = []
     with Launcher(replace(settings, map_path=large)) as launcher:
-        for _ in range(4):
+        for _ in range(3):  # as often as a node is started again
             right_s, status = (
                 until_right(launcher, query, asked.file),
                 launcher.bus.request(topics.STATUS["vocab"], Empty()),
             )
             rows.append({"s": round(right_s, 2), "described": status.counters.get("places_described_at_start")})
+            print(json.dumps(rows[-1]), flush=True)
             killed = [
                 child for child in psutil.Process().children() if "seamark.service.nodes" in " ".join(child.cmdline())
             ]
