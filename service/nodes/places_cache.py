@@ -46,6 +46,10 @@ class PlacesCache:
     def changed(self, index: PlaceIndex) -> None:
         """Note that a place was added or removed; from time to time this begins to write the index."""
         self._changes += 1
+        self.write_if_due(index)
+
+    def write_if_due(self, index: PlaceIndex) -> None:
+        """Begin to write the index if much has changed: after a start that described a whole map, at once."""
         idle = self._writing is None or not self._writing.is_alive()
         if idle and self._changes >= max(LEAST_CHANGES, SHARE_OF_PLACES * len(index)):
             self._begin(index)

@@ -122,6 +122,8 @@ def build(bus: Bus, settings: NodeSettings) -> VocabNode:
     meter.keep("places_described_at_start", described)
     kept = settings.patient and not settings.localise_only  # a run ends before anything would be gained
     cache = PlacesCache(cache_path(settings.map_path), meter, described) if kept else None
+    if cache is not None:
+        cache.write_if_due(index)
     return VocabNode(bus, index, cache, meter)
 
 
