@@ -59,7 +59,7 @@ class FrontendConfig(BaseModel):
         "a keyframe of the window is not worth one of the map",
     )
     window_keyframes: int = Field(8, ge=3, le=30, description="keyframes adjusted together")
-    window_iterations: int = Field(6, ge=1, le=50, description="Levenberg-Marquardt steps at most")
+    window_iterations: int = Field(4, ge=1, le=50, description="Levenberg-Marquardt steps at most")
 
     covisible_keyframes: int = Field(
         8, ge=0, le=30, description="keyframes that have left the window, share its landmarks and hold it"

@@ -1,7 +1,6 @@
 """One session's tracking state: live tracks, landmarks, and the window of recent keyframes."""
 
 from dataclasses import dataclass, field, replace
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,10 +166,19 @@ class Session:
 
         What has left the window is not forgotten: without it, scale and heading would hang on the oldest pose alone.
         """
-        seen = np.unique(np.concatenate([k.track_ids for k in self.window]))
+        if not self.archive:
+            return []
+        seen = np.concatenate([k.track_ids for k in self.window])
+        sizes = [len(k.track_ids) for k in self.archive]
+        again = np.isin(np.concatenate([k.track_ids for k in self.archive]), seen)
+        shares = np.bincount(np.repeat(np.arange(len(sizes)), sizes), weights=again, minlength=len(sizes))
         anchored = {k.stamp_ns for k in self.anchors}
-        others = (k for k in reversed(self.archive) if k.stamp_ns not in anchored and self._shares(k, seen))
-        return [*self.anchors, *islice(others, self.config.covisible_keyframes)]
+        others = [
+            k
+            for k, shared in zip(reversed(self.archive), shares[::-1], strict=True)
+            if shared >= self.config.revisit_min_landmarks and k.stamp_ns not in anchored
+        ]
+        return [*self.anchors, *others[: self.config.covisible_keyframes]]
 
     def insert_keyframe(
         self,

@@ -18,7 +18,7 @@ from seamark.frontend.pyramid import Pyramid
 from seamark.frontend.residuals import Observations
 
 INITIAL_DAMPING = 1e-4
-RELATIVE_DECREASE = 1e-4
+RELATIVE_DECREASE = 1e-3  # the next keyframe goes on from here
 
 
 @dataclass(frozen=True, eq=False)
