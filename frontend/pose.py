@@ -86,20 +86,17 @@ def estimate_pose(
         )
 
     if start is not None:
-        starts = [(start.T_odom_cam, start.inliers)]
-    else:
-        if prediction is not None:
-            expected = converge(prediction.T_odom_cam, np.ones(len(observations.landmarks), bool))
-            if expected is not None and votes[expected[0].inliers].sum() > UNCONTESTED_SHARE * votes.sum():
-                return expected[0]
-        sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
-        starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, prediction, votes)
-    best, best_score = None, np.inf
-    for T_odom_cam, inliers in starts:
-        found = converge(T_odom_cam, inliers)
-        if found is not None and found[1] < best_score:
-            best, best_score = found
-    return best
+        found = converge(start.T_odom_cam, start.inliers)
+        return None if found is None else found[0]
+    expected = None
+    if prediction is not None:
+        expected = converge(prediction.T_odom_cam, np.ones(len(observations.landmarks), bool))
+        if expected is not None and votes[expected[0].inliers].sum() > UNCONTESTED_SHARE * votes.sum():
+            return expected[0]
+    sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
+    starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, votes)
+    candidates = [expected, *(converge(*one) for one in starts)]
+    return min((c for c in candidates if c is not None), key=lambda found: found[1], default=(None, 0.0))[0]
 
 
 def _starts(
@@ -109,20 +106,14 @@ def _starts(
     threshold_px: float,
     iterations: int,
     minimum: int,
-    prediction: Prediction | None,
     votes: NDArray[np.float64],
 ) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
-    """Return the poses to start from, with the landmarks (N,) that speak for each."""
-    starts = []
-    everything = np.ones(len(observations.landmarks), bool)
-    if len(sample) < 2 * minimum:  # too few to sample from: what is predicted is another place to start from
-        if prediction is not None:
-            starts.append((prediction.T_odom_cam, everything))
+    """Return the poses that samples lead to, with the landmarks (N,) that speak for each."""
+    if len(sample) < 2 * minimum:  # too few to sample from
         sample = np.arange(len(observations.landmarks))
-    starts += _sample_consensus(observations, sample, camera, threshold_px, iterations, minimum)
-    if starts and prediction is not None and votes[starts[-1][1]].sum() < CONTESTED_SHARE * votes.sum():
-        others = sample[~starts[-1][1][sample]]
-        starts.append((prediction.T_odom_cam, everything))
+    starts = _sample_consensus(observations, sample, camera, threshold_px, iterations, minimum)
+    if starts and votes[starts[0][1]].sum() < CONTESTED_SHARE * votes.sum():
+        others = sample[~starts[0][1][sample]]
         starts += _sample_consensus(observations, others, camera, threshold_px, iterations, minimum)
     return starts
 

@@ -130,10 +130,15 @@ class LandmarkTable:
 
     def set(self, track_ids: NDArray[np.int64], positions: NDArray[np.float64], spreads: NDArray[np.float64]) -> None:
         """Store positions (N, 3) and spreads (N,) of different ids."""
-        ids = np.concatenate([track_ids, self._ids])
-        self._ids, first = np.unique(ids, return_index=True)  # of an id that is held the new position comes first
-        self._positions = np.vstack([positions, self._positions])[first]
-        self._spreads = np.concatenate([spreads, self._spreads])[first]
+        index, held = self._find(track_ids)
+        self._positions[index[held]], self._spreads[index[held]] = positions[held], spreads[held]
+        if held.all():
+            return
+        ids = np.concatenate([self._ids, track_ids[~held]])
+        order = np.argsort(ids, kind="stable")
+        self._ids = ids[order]
+        self._positions = np.vstack([self._positions, positions[~held]])[order]
+        self._spreads = np.concatenate([self._spreads, spreads[~held]])[order]
 
     def retain(self, track_ids: NDArray[np.int64]) -> None:
         """Forget all ids but these: one track that lives for ever must not keep all that came after it."""
