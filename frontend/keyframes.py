@@ -23,7 +23,7 @@ from seamark.frontend.features import extract_features, match_descriptors, thumb
 from seamark.frontend.two_view import triangulate
 from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
-MAX_PENDING = 4
+MAX_PENDING = 8
 TRIANGULATION_PX = 2.0
 NO_OFFSET = DepthOffset.expected(0.0)
 RELATIVE_SIGMA = 0.2  # a landmark whose depth is less sure than this is not worth keeping
