@@ -3,7 +3,8 @@
 DATA is the folder with the real sequences. Stages and steps are in milliseconds of CPU of the tracking thread, median /
 95th percentile, which other programs do not disturb, and steps in wall time as well. CPU per frame includes the
 keyframe thread; reading files is left out. Each run has a process of its own, whose peak RSS is that of all it did
-(the interpreter, decoding images and the sequence's own buffers included).
+(the interpreter, decoding images and the sequence's own buffers included). Without a pause between frames keyframes
+wait for their SIFT; with ``--rate`` frames come as from a camera.
 """
 
 import argparse
@@ -36,15 +37,18 @@ COLUMNS = (
 )
 
 
-def measure(spec: str, mode: str) -> list[str]:
-    """Run one sequence and return the cells of its row."""
+def measure(spec: str, mode: str, rate: float | None) -> list[str]:
+    """Run one sequence, a frame every 1 / rate seconds or without a pause, and return the cells of its row."""
     cv2.setNumThreads(1)
     source = open_sources([spec], mode=mode)
     assert source.ground_truth is not None
     frontend = Frontend(source.rig, source.mode, FrontendConfig(), clock=time.thread_time)
     said, stages = [], defaultdict[str, list[float]](list)
     wall_ms, own_ms, cpu_s = [], [], 0.0
+    begin = time.perf_counter()
     for frame in source.frames():
+        if rate is not None:
+            time.sleep(max(0.0, begin + frame.index / rate - time.perf_counter()))
         wall, own, cpu = time.perf_counter(), time.thread_time(), time.process_time()
         said.append(frontend.step(frame).odometry)
         wall_ms.append(1e3 * (time.perf_counter() - wall))
@@ -68,9 +72,9 @@ def measure(spec: str, mode: str) -> list[str]:
         pair(own_ms),
         pair(np.array(own_ms)[at_keyframe]),
         pair(wall_ms),
-        f"{1e3 * len(said) / sum(wall_ms):.0f}",
+        "-" if rate else f"{1e3 * len(said) / sum(wall_ms):.0f}",
         f"{at_keyframe.sum()} of {len(said)}",
-        f"{1e3 * cpu_s / len(said):.1f}",
+        "-" if rate else f"{1e3 * cpu_s / len(said):.1f}",
         f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}",
         f"{error_m:.4f}",
     ]
@@ -84,7 +88,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="folder with the real sequences")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(RUNS)}")
-    given = parser.parse_args()
+    parser.add_argument("--rate", type=float, help="frames per second that arrive; without it one follows the other")
+    given = parser.parse_intermixed_args()
     unknown = set(given.names) - set(RUNS)
     if unknown:
         sys.exit(f"unknown: {', '.join(sorted(unknown))}")
@@ -92,7 +97,7 @@ def main() -> None:
     for name in given.names or RUNS:
         folder, mode = RUNS[name]
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            cells = pool.apply(measure, (str(given.data / folder), mode))
+            cells = pool.apply(measure, (str(given.data / folder), mode, given.rate))
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
