@@ -19,6 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from real_sequences import REAL
 
 from seamark.frontend import se3
 from seamark.frontend.config import FrontendConfig
@@ -28,13 +29,6 @@ from seamark.service.evaluation import Alignment, associate, ate, rpe
 from seamark.service.sources.open import open_sources
 from seamark.service.types import Trajectory
 
-REAL = {
-    "tum_fr1_rpy rgbd": ("tum_fr1_rpy", "rgbd"),
-    "rgbd_hololens rgbd": ("rgbd_hololens", "rgbd"),
-    "rgbd_hololens mono": ("rgbd_hololens", "mono"),
-    "kitti06 stereo": ("kitti06_stereo_000-050", "stereo"),
-    "kitti06 mono": ("kitti06_stereo_000-050", "mono"),
-}
 PLACES = ("loop,trajectory=loop,frames=780", "twins,frames=790", "street,frames=760")
 SEEDS = (0, 1, 2)
 CHI2_6DOF_95 = 12.59

@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from real_sequences import REAL
 
 from seamark.frontend import odometry, pose, session, tracker
 from seamark.frontend.camera import Camera
@@ -27,13 +28,6 @@ from seamark.service.evaluation import Alignment, ate
 from seamark.service.sources.open import open_sources
 from seamark.service.types import Trajectory
 
-REAL = {
-    "tum_fr1_rpy rgbd": ("tum_fr1_rpy", "rgbd"),
-    "rgbd_hololens rgbd": ("rgbd_hololens", "rgbd"),
-    "rgbd_hololens mono": ("rgbd_hololens", "mono"),
-    "kitti06 stereo": ("kitti06_stereo_000-050", "stereo"),
-    "kitti06 mono": ("kitti06_stereo_000-050", "mono"),
-}
 CROWD = "synth:loop,trajectory=loop,frames=780,crowd=40,image=320x240"
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 TANGENTIAL_X = 3  # place of the coefficient that changes its sign in a mirror
@@ -67,7 +61,7 @@ ABLATIONS: dict[str, tuple[dict[str, Any], list[tuple[Any, str, Any]]]] = {
     "return check of flow off": ({}, [(tracker.flow, "track", without_return_check)]),
     "correlation check of flow off": ({"flow_min_correlation": -1.0}, []),
     "motion prior of flow off": ({}, [(tracker, "predict_pixels", lambda s, tracks: tracks.pixels)]),
-    "pose always from samples": ({}, [(pose, "UNCONTESTED_SHARE", 2.0)]),
+    "pose always from samples": ({}, [(pose, "CONTESTED_SHARE", 2.0)]),
     "votes by parts of the picture off": ({}, [(tracker, "static_votes", equal_votes)]),
     "gate that follows the noise off": ({}, [(session.Session, "gate_px", lambda self: self.config.pnp_threshold_px)]),
     "presumed distances off": ({}, [(session.Session, "_landmarks_presumed", lambda self: None)]),

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from real_sequences import REAL
 
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.odometry import Frontend
@@ -24,12 +25,6 @@ from seamark.service.evaluation import Alignment, ate
 from seamark.service.sources.open import open_sources
 from seamark.service.types import Trajectory
 
-RUNS = {
-    "tum_fr1_rpy rgbd": ("tum_fr1_rpy", "rgbd"),
-    "rgbd_hololens rgbd": ("rgbd_hololens", "rgbd"),
-    "kitti06 stereo": ("kitti06_stereo_000-050", "stereo"),
-    "kitti06 mono": ("kitti06_stereo_000-050", "mono"),
-}
 STAGES = ("track", "pose", "settle", "keyframe")
 COLUMNS = (
     *("run", *STAGES, "step CPU", "step CPU at keyframes", "step wall", "frames/s", "keyframes"),
@@ -87,15 +82,15 @@ def pair(ms: list[float] | np.ndarray) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="folder with the real sequences")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(RUNS)}")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(REAL)}")
     parser.add_argument("--rate", type=float, help="frames per second that arrive; without it one follows the other")
     given = parser.parse_intermixed_args()
-    unknown = set(given.names) - set(RUNS)
+    unknown = set(given.names) - set(REAL)
     if unknown:
         sys.exit(f"unknown: {', '.join(sorted(unknown))}")
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    for name in given.names or RUNS:
-        folder, mode = RUNS[name]
+    for name in given.names or REAL:
+        folder, mode = REAL[name]
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             cells = pool.apply(measure, (str(given.data / folder), mode, given.rate))
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)

@@ -16,7 +16,6 @@ ITERATIONS = 8
 CONVERGED = 1e-7
 NEAREST_M = 1e-3
 CONTESTED_SHARE = 0.8  # of all votes: where fewer agree with a pose, others are asked for
-UNCONTESTED_SHARE = 0.8  # of all votes: where more agree with the pose that the prediction leads to, nothing is sampled
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -91,7 +90,7 @@ def estimate_pose(
     expected = None
     if prediction is not None:
         expected = converge(prediction.T_odom_cam, np.ones(len(observations.landmarks), bool))
-        if expected is not None and votes[expected[0].inliers].sum() > UNCONTESTED_SHARE * votes.sum():
+        if expected is not None and votes[expected[0].inliers].sum() >= CONTESTED_SHARE * votes.sum():
             return expected[0]
     sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
     starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, votes)

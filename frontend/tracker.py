@@ -95,7 +95,7 @@ def estimate(
     observations, known = session.observations(tracks, *reading)
     votes = static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera)
     pose, prediction = None, session.prediction()
-    for threshold_px in (session.gate_px(), c.pnp_threshold_px):
+    for threshold_px in dict.fromkeys((session.gate_px(), c.pnp_threshold_px)):  # once where they are the same
         pose = estimate_pose(
             observations,
             session.camera,

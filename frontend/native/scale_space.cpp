@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <memory>
+#include <utility>
 
 #include "clones.hpp"
 
@@ -19,7 +21,7 @@ constexpr int kRefinements = 5;
 constexpr float kEdgeRatio = 10;      // largest ratio of the principal curvatures
 constexpr float kCameraSigma = 0.5f;  // blur that an image is taken to have
 constexpr int kDifferences = kScales - 1;
-constexpr int64_t kKeptFloats = 16 << 20;  // a thread keeps so much memory for the next image
+constexpr int64_t kKeptFloats = 16 << 20;  // what a thread asked for beyond this goes back at its next image
 
 // Four sigma of each blur, as OpenCV has it: of the base, and of each scale from the one before.
 constexpr int kBaseRadius = 5;

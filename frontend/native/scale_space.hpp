@@ -2,9 +2,7 @@
 // Scale-Invariant Keypoints" (2004), sections 3 and 4.
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 #include "pyramid.hpp"
@@ -33,7 +31,8 @@ struct Extremum {
     float x, y, sigma, response;
 };
 
-// The first octave has twice the pixels of the image per side, each of the others half as many as the one before.
+// The first octave has twice the pixels of the image per side, each of the others half as many as the one before. The
+// planes lie in memory of the thread: they are those of the last image that it has taken.
 class ScaleSpace {
 public:
     explicit ScaleSpace(const Level& image, float contrast);
