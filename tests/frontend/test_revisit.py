@@ -1,5 +1,7 @@
 """Landmarks of earlier keyframes, seen again, against exact poses of the toy world."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,13 +9,15 @@ from seamark.datasets_synth.toy import ToyWorld
 from seamark.frontend import se3
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.corners import detect_corners
+from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import grey_of
 from seamark.frontend.odometry import Frontend
 from seamark.frontend.pyramid import pyramid_of
 from seamark.frontend.revisit import find_again, worth_revisiting
+from seamark.frontend.session import Session
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.types import Frame, Mode
-from seamark.frontend.window import WindowKeyframe
+from seamark.frontend.window import BundleProblem, BundleResult, WindowKeyframe, adjust
 
 WORLD = ToyWorld(5)
 CONFIG = FrontendConfig(max_corners=250, sift_features=200)
@@ -92,3 +96,33 @@ def test_a_camera_that_looks_to_and_fro_does_not_drift() -> None:
     kept, forgotten = (last_errors(CONFIG.model_copy(update={"revisit_keyframes": n})) for n in (3, 0))
     assert 0 < kept.mean() < 0.03
     assert kept.mean() < 0.8 * forgotten.mean()
+
+
+def test_keyframes_that_have_left_the_window_hold_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test: four keyframes have left the window; one shares too few landmarks with it. Expected: the two newest of the
+    others take part in the adjustment, held still, and no more than are asked for.
+    """
+    config = FrontendConfig(covisible_keyframes=2, revisit_min_landmarks=12)
+    points = np.random.default_rng(0).uniform((-2, -1.5, 3), (2, 1.5, 6), (60, 3))
+    session = Session(0, config, WORLD.camera, True, np.eye(4), DepthOffset.expected(0.0))
+    session.landmarks.set(np.arange(60), points, np.full(60, 0.01))
+
+    def keyframe(number: int, ids: np.ndarray) -> WindowKeyframe:
+        T = se3.make(np.eye(3), np.array([0.1 * number, 0, 0]))
+        pixels = WORLD.camera.project_ideal(se3.transform(se3.inverse(T), points[ids]))
+        image, unknown = pyramid_of(np.zeros((64, 64), np.uint8), 0), np.full(len(ids), np.nan)
+        return WindowKeyframe(number, number, T, image, ids, pixels.astype(np.float32), pixels, unknown, unknown)
+
+    everything = np.arange(60)
+    session.archive = [keyframe(k, everything) for k in range(3)] + [keyframe(3, everything[:5])]
+    session.window = [keyframe(k, everything) for k in (4, 5)]
+    given = []
+
+    def watched(problem: BundleProblem, *rest: Any, **settings: Any) -> BundleResult:
+        given.append(problem)
+        return adjust(problem, *rest, **settings)
+
+    monkeypatch.setattr("seamark.frontend.session.adjust", watched)
+    session.adjust_window()
+    assert [round(10 * T[0, 3]) for T in given[0].poses] == [2, 1, 4, 5]
+    assert given[0].n_fixed == 3
