@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
@@ -32,7 +32,8 @@ RESTORE_TIMEOUT_S = 1800.0  # a large map without a place index beside it is des
 STOP_TIMEOUT_S = 4.5  # for all nodes together
 # Until when each node may take its time, so that those behind it have theirs; what has not ended then is killed.
 STOP_SHARES = {FRONTEND: 0.45, VOCAB: 0.6, BACKEND: 1.0}
-MAX_RESTARTS = 3
+MAX_RESTARTS = 3  # of one node within RESTARTS_WITHIN_S: a crash now and then in months is none too many
+RESTARTS_WITHIN_S = 600.0
 # More keyframes than a front end can have announced without having handed them over.
 LOST_KEYFRAMES = 4 * KEYFRAME.depth
 # One thread per process and library: OpenCV, BLAS and OpenMP would otherwise fight for the same cores.
@@ -41,6 +42,10 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 class NodeFailedError(BusError):
     """A node could not start, or died more often than it may be restarted; the text is its own last word."""
+
+
+class StartInterruptedError(BusError):
+    """The service was told to stop before its nodes were alive."""
 
 
 @dataclass
@@ -60,8 +65,10 @@ class Launcher:
     """The three node processes and the session that connects them; a context manager.
 
     Without ``settings.endpoint`` a Zenoh router runs in this process, on a free port of loopback or at ``listen``.
-    Nodes that die are restarted at most ``max_restarts`` times each. ``commands`` replaces how nodes are started.
-    Raises NodeFailedError, SessionError and TimedOutError.
+    Nodes that die are restarted at most ``max_restarts`` times each within RESTARTS_WITHIN_S. ``commands`` replaces how
+    nodes are started.
+    ``interrupted`` is asked while the nodes come alive, which may take long with a large map: once it is true, that is
+    given up. Raises NodeFailedError, SessionError, TimedOutError and StartInterruptedError.
     """
 
     def __init__(
@@ -71,6 +78,7 @@ class Launcher:
         listen: str | None = None,
         max_restarts: int = MAX_RESTARTS,
         commands: Mapping[str, Sequence[str]] | None = None,
+        interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
         own_router = not settings.endpoint
         self.endpoint = settings.endpoint or listen or free_endpoint()
@@ -78,6 +86,7 @@ class Launcher:
         self._settings = replace(settings, endpoint=self.endpoint, restore=map_exists)
         self._own_router = own_router
         self._max_restarts = max_restarts
+        self._interrupted = interrupted
         self._commands = commands or {
             name: (sys.executable, "-m", f"seamark.service.nodes.{name}_node") for name in NODES
         }
@@ -87,6 +96,7 @@ class Launcher:
         self._stopping = False
         self._failure: NodeFailedError | None = None
         self.restarts = dict.fromkeys(NODES, 0)
+        self._restarted_at: dict[str, list[float]] = {name: [] for name in NODES}  # lately
         self._session: Any = None
         self._watch: Watch | None = None
         self._bus: ZenohBus | None = None
@@ -129,7 +139,7 @@ class Launcher:
     def wait_until_alive(self, timeout_s: float = START_TIMEOUT_S) -> None:
         """Wait until all nodes answer; raises NodeFailedError or TimedOutError."""
         assert self._watch is not None
-        self._watch.wait_for(NODES, timeout_s, self.check)
+        self._watch.wait_for(NODES, timeout_s, self._check_start)
 
     def stop(self, gently: bool = True) -> tuple[ProcessUsage, ...]:
         """Stop frontend, vocab and backend in this order and return what each has used; may be called again.
@@ -178,11 +188,16 @@ class Launcher:
             with self._lock:
                 self._start(name, self._settings)
         if self._settings.restore:
-            self._watch.wait_for((BACKEND, VOCAB), RESTORE_TIMEOUT_S, self.check)
+            self._watch.wait_for((BACKEND, VOCAB), RESTORE_TIMEOUT_S, self._check_start)
             self._counting_on()
         with self._lock:
             self._start(FRONTEND, self._settings)
         self.wait_until_alive()
+
+    def _check_start(self) -> None:
+        self.check()
+        if self._interrupted():
+            raise StartInterruptedError("stopped before the nodes were alive")
 
     def _start(self, name: str, settings: NodeSettings) -> None:
         process = subprocess.Popen(
@@ -222,10 +237,13 @@ class Launcher:
 
     def _replace(self, child: _Child) -> None:
         sentence = f"the {child.name} node has ended: {child.last_word}"
+        now = time.monotonic()
+        lately = [at for at in self._restarted_at[child.name] if at > now - RESTARTS_WITHIN_S]
         # An error that it could name would come again; only what was killed or crashed is worth another try.
-        if child.exit_code == 1 or self.restarts[child.name] >= self._max_restarts:
+        if child.exit_code == 1 or len(lately) >= self._max_restarts:
             self._failure = NodeFailedError(sentence)
             return
+        self._restarted_at[child.name] = [*lately, now]
         logger.warning("%s; it is started again", sentence)
         self._settings = replace(self._settings, restore=self._settings.map_path is not None)
         if child.name == FRONTEND:

@@ -2,8 +2,6 @@
 
 import contextlib
 import logging
-import signal
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +11,11 @@ from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Mode
 from seamark.service.calibration import load_calibration
 from seamark.service.config import SeamarkConfig
-from seamark.service.launcher import Launcher
+from seamark.service.launcher import Launcher, StartInterruptedError
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.run import for_mode
 from seamark.service.sources.base import SourceError, choose, offered
+from seamark.service.stop_signal import StopSignal
 
 CHECK_EVERY_S = 0.5
 
@@ -66,15 +65,18 @@ def settings_for(options: ServeOptions, config: SeamarkConfig) -> NodeSettings:
 def serve(options: ServeOptions, config: SeamarkConfig, ready: Callable[[str, str], None]) -> None:
     """Start the nodes, call ``ready(endpoint, mode)``, wait for SIGINT or SIGTERM, and stop the nodes in order.
 
+    A signal while they start ends that too.
+
     Raises NodeFailedError when a node dies more often than it is restarted, SessionError when the endpoint cannot be
     used, and SeamarkError for bad settings.
     """
     settings = settings_for(options, config)
     _look_at(options.map_path, options.localise_only)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    with Launcher(settings, listen=options.listen) as launcher:
+    stop = StopSignal()
+    with (
+        contextlib.suppress(StartInterruptedError),
+        Launcher(settings, listen=options.listen, interrupted=lambda: stop.ordered) as launcher,
+    ):
         ready(launcher.endpoint, settings.mode)
         while not stop.wait(CHECK_EVERY_S):
             launcher.check()

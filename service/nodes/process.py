@@ -19,6 +19,7 @@ import cv2
 from seamark import SeamarkError
 from seamark.service.bus import Bus
 from seamark.service.nodes.settings import NodeSettings
+from seamark.service.stop_signal import StopSignal, StopSignalError
 from seamark.service.zenoh_bus import ZenohBus
 from seamark.service.zenoh_session import announce, open_session
 
@@ -56,17 +57,18 @@ def read_settings(stream: BinaryIO) -> NodeSettings:
 def run_process(name: str, build: Callable[[Bus, NodeSettings], Node]) -> int:
     """Run a node until SIGTERM, SIGINT or the end of standard input; returns the exit code.
 
-    An error at the start is one sentence on standard output, for the parent to show.
+    An error at the start is one sentence on standard output, for the parent to show. ``build`` may take its time, as
+    with a map of which every place is to be described: it is interrupted.
     """
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = StopSignal()
     settings = read_settings(sys.stdin.buffer)
     logging.basicConfig(level=settings.log_level, format=f"%(asctime)s {name} %(levelname)s %(name)s: %(message)s")
     cv2.setNumThreads(1)
-    threading.Thread(target=_follow_parent, args=(stop,), name="parent", daemon=True).start()
+    threading.Thread(target=_follow_parent, name="parent", daemon=True).start()
     try:
         _live(name, build, settings, stop)
+    except StopSignalError:
+        logging.getLogger(__name__).debug("stopped while the %s node was being made", name)
     except SeamarkError as error:
         sys.stdout.write(f"{error}\n")
         return EXIT_FAILED
@@ -77,11 +79,11 @@ def run_process(name: str, build: Callable[[Bus, NodeSettings], Node]) -> int:
     return 0
 
 
-def _live(name: str, build: Callable[[Bus, NodeSettings], Node], settings: NodeSettings, stop: threading.Event) -> None:
+def _live(name: str, build: Callable[[Bus, NodeSettings], Node], settings: NodeSettings, stop: StopSignal) -> None:
     with open_session("client", connect=[settings.endpoint]) as session:
         bus = ZenohBus(session, name, settings.namespace)
         try:
-            node = build(bus, settings)
+            node = stop.interrupting(lambda: build(bus, settings))
             try:
                 token = announce(session, settings.namespace, name)
                 stop.wait()
@@ -94,11 +96,11 @@ def _live(name: str, build: Callable[[Bus, NodeSettings], Node], settings: NodeS
             bus.close()
 
 
-def _follow_parent(stop: threading.Event) -> None:
+def _follow_parent() -> None:
     # Unbuffered: a thread that waits in a buffered read holds a lock which the interpreter's end would stumble over.
     with open(0, "rb", buffering=0, closefd=False) as stream:
         while stream.read(1024):
             pass
-    stop.set()
+    os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(ORPHAN_PATIENCE_S)
     os._exit(EXIT_FAILED)  # it waits for acknowledgements of nodes that have gone too

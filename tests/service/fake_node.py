@@ -51,6 +51,8 @@ class FakeNode:
 def build(bus: Bus, settings: NodeSettings) -> FakeNode:
     if bus.node == topics.VOCAB and sys.argv[2] == "ill":
         raise SeamarkError("the vocabulary words.npz is damaged")
+    if bus.node == topics.VOCAB and sys.argv[2] == "slow":
+        time.sleep(600)
     return FakeNode(bus, settings)
 
 

@@ -14,7 +14,7 @@ import pytest
 from seamark.frontend.types import Frame, Mode
 from seamark.service import launcher as launcher_module
 from seamark.service.bus import BusError, UnavailableError
-from seamark.service.launcher import LOST_KEYFRAMES, Launcher, NodeFailedError
+from seamark.service.launcher import LOST_KEYFRAMES, Launcher, NodeFailedError, StartInterruptedError
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty
 from seamark.service.topics import BACKEND, FRAME, FRONTEND, NODES, STATUS, VOCAB
@@ -102,6 +102,38 @@ def test_a_node_that_dies_too_often_is_given_up(tmp_path: Path) -> None:
 def test_a_node_that_cannot_start_says_why(tmp_path: Path) -> None:
     with pytest.raises(NodeFailedError, match=r"the vocab node has ended: the vocabulary words\.npz is damaged"):
         launch(tmp_path, "ill").__enter__()
+
+
+def test_a_start_that_takes_long_can_be_given_up(tmp_path: Path) -> None:
+    """Test: the vocabulary describes a large map, and the service is told to stop. Expected: gone soon, unforced."""
+    launcher: Launcher | None = None
+    pids: list[int] = []
+
+    def interrupted() -> bool:
+        assert launcher is not None
+        pids.append(launcher.process_id(VOCAB))
+        return len(pids) > 5  # its interpreter has come far enough to read the settings, or waits for them
+
+    settings = NodeSettings(Mode.RGBD, map_path=tmp_path / "stopped.txt", namespace="launcher")
+    commands = {name: (sys.executable, SCRIPT, name, "slow") for name in NODES}
+    launcher = Launcher(settings, commands=commands, interrupted=interrupted)
+    began = time.monotonic()
+    with pytest.raises(StartInterruptedError):
+        launcher.__enter__()
+    assert time.monotonic() - began < launcher_module.STOP_TIMEOUT_S + 2
+    assert len(set(pids)) == 1 and gone(pids[0])
+    assert all(one.peak_rss_bytes for one in launcher.stop()) and launcher.restarts == dict.fromkeys(NODES, 0)
+
+
+def test_crashes_far_apart_are_none_too_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test: a node crashes once in each period in which it may once. Expected: it is started again each time."""
+    monkeypatch.setattr(launcher_module, "RESTARTS_WITHIN_S", 0.0)
+    with launch(tmp_path, max_restarts=1) as launcher:
+        for count in (1, 2, 3):
+            os.kill(launcher.process_id(VOCAB), signal.SIGKILL)
+            wait_until(lambda count=count: launcher.restarts[VOCAB] == count)  # type: ignore[misc]
+            launcher.wait_until_alive()
+        launcher.check()
 
 
 def test_a_node_that_does_not_stop_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
