@@ -26,6 +26,7 @@ def follow(
     back_top: int,
     level: str | None = None,
     level_out: bool = True,
+    least_likeness: float = -1.0,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 def strongest(
     image: NDArray[np.uint8], cell: int, border: int, harris_k: float, mask: NDArray[np.uint8] | None
@@ -51,33 +52,26 @@ def align_warped(
     start: NDArray[np.float32],
     unwarp: NDArray[np.float32],
 ) -> _Aligned: ...
-def refine_pose(
+def converge(
     T_odom_cam: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
     landmarks: NDArray[np.float64],
     pixels: NDArray[np.float64],
     inverse_depth: NDArray[np.float64],
     inverse_sigma: NDArray[np.float64],
     spread: NDArray[np.float64] | None,
     origin: NDArray[np.float64] | None,
+    votes: NDArray[np.float64],
     camera: _Camera,
     pixel_sigma: float,
     expected: NDArray[np.float64] | None,
     sigma_m: float,
-    iterations: int,
-    converged: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None: ...
-def pixel_errors(
-    T_odom_cam: NDArray[np.float64],
-    landmarks: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-    inverse_depth: NDArray[np.float64],
-    inverse_sigma: NDArray[np.float64],
-    spread: NDArray[np.float64] | None,
-    origin: NDArray[np.float64] | None,
-    camera: _Camera,
-    pixel_sigma: float,
+    threshold_px: float,
     nearest_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]: ...
+    minimum: int,
+    iterations: int,
+    least_step: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], float, float, float] | None: ...
 def adjust(
     poses: NDArray[np.float64],
     n_fixed: int,

@@ -36,7 +36,9 @@ def track(
     first = start if guess is None else np.ascontiguousarray(guess, np.float32)
     side, back = window_px // 2 * 2 + 1, min(BACK_LEVELS, levels)
     changed = abs(_brightness(after) - _brightness(before)) > BRIGHTNESS_GREY
-    there, round_trip, correlation = native.follow(before, after, start, first, side, levels, back, level_out=changed)
+    there, round_trip, correlation = native.follow(
+        before, after, start, first, side, levels, back, level_out=changed, least_likeness=min_correlation
+    )
     height, width = after.grey.shape
     inside = (there >= 0).all(axis=1) & (there <= [width - 1, height - 1]).all(axis=1)
     return there, inside & (round_trip < round_trip_px) & (correlation >= min_correlation)

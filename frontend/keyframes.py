@@ -1,10 +1,13 @@
 """What a keyframe carries beyond its pose: SIFT, landmarks, JPEG, thumbnail; made in a thread beside tracking.
 
 SIFT costs as much as ten frames of tracking and OpenCV frees the interpreter while it works, so one plain thread
-keeps it off the frame's latency. Keyframes come out in the order they went in; nothing that the tracker decides
+keeps it off the frame's latency, and gives way where there is one core only. Keyframes come out in the order they went in; nothing that the tracker decides
 depends on when.
 """
 
+import os
+import sys
+import threading
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,6 +27,7 @@ from seamark.frontend.two_view import triangulate
 from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
 MAX_PENDING = 8
+NICENESS = 10  # a tenth of tracking's share of a core that both want
 TRIANGULATION_PX = 2.0
 NO_OFFSET = DepthOffset.expected(0.0)
 RELATIVE_SIGMA = 0.2  # a landmark whose depth is less sure than this is not worth keeping
@@ -42,12 +46,19 @@ class KeyframeRequest:
     depth_offset: DepthOffset
 
 
+def _give_way() -> None:
+    """Let tracking go first where there is one core for both: what this thread makes can wait, a pose cannot."""
+    if sys.platform == "linux":  # elsewhere it would be the whole process that gives way
+        niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+
+
 class KeyframeBuilder:
     """Turns requests into keyframes, in order, in one thread."""
 
     def __init__(self, rig: Rig | None, mode: Mode, config: FrontendConfig, sensor: DepthSensor) -> None:
         self._rig, self._mode, self._config, self._sensor = rig, mode, config, sensor
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=_give_way)
         self._pending: deque[Future[list[Keyframe]]] = deque()
         self._ready: list[Keyframe] = []
         self._recent: deque[Keyframe] = deque(maxlen=config.recovery_keyframes)

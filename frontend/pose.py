@@ -14,6 +14,7 @@ from seamark.frontend.residuals import Observations, residuals_and_jacobian, shi
 
 ITERATIONS = 8
 CONVERGED = 1e-7
+RAYLEIGH_MEDIAN = 1.1774  # per sigma of either coordinate
 NEAREST_M = 1e-3
 CONTESTED_SHARE = 0.8  # of all votes: where fewer agree with a pose, others are asked for
 
@@ -61,9 +62,8 @@ def estimate_pose(
     """Estimate the pose; None when fewer than ``minimum`` landmarks agree.
 
     The prediction is refined first; where nearly all landmarks agree with what it leads to, that is the pose. Elsewhere
-    P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`refine_pose` twice, the second time on the inliers of
-    the refined pose. With a prediction, landmarks of uncertain distance take part: they hold the rotation, and the
-    translation across their line of sight. ``votes`` (N,) weigh the landmarks where they disagree: then what the others
+    P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`converge`. With a prediction, landmarks of uncertain
+    distance take part: they hold the rotation, and the translation across their line of sight. ``votes`` (N,) weigh the landmarks where they disagree: then what the others
     agree on, and what is predicted, stand for election beside the largest consensus. A ``start``, the pose of the same
     landmarks when their pixels were hardly different, is refined without sampling.
     """
@@ -71,8 +71,8 @@ def estimate_pose(
         return None
     votes = np.ones(len(observations.landmarks)) if votes is None else votes
 
-    def converge(T_odom_cam: Array, inliers: NDArray[np.bool_]) -> tuple[PoseEstimate, float] | None:
-        return _converge(
+    def converged(T_odom_cam: Array, inliers: NDArray[np.bool_]) -> tuple[PoseEstimate, float] | None:
+        return converge(
             T_odom_cam,
             inliers,
             observations,
@@ -85,16 +85,16 @@ def estimate_pose(
         )
 
     if start is not None:
-        found = converge(start.T_odom_cam, start.inliers)
+        found = converged(start.T_odom_cam, start.inliers)
         return None if found is None else found[0]
     expected = None
     if prediction is not None:
-        expected = converge(prediction.T_odom_cam, np.ones(len(observations.landmarks), bool))
+        expected = converged(prediction.T_odom_cam, np.ones(len(observations.landmarks), bool))
         if expected is not None and votes[expected[0].inliers].sum() >= CONTESTED_SHARE * votes.sum():
             return expected[0]
     sample = _as_good_as_exact(observations, camera, threshold_px, pixel_sigma, prediction)
     starts = _starts(observations, sample, camera, threshold_px, iterations, minimum, votes)
-    candidates = [expected, *(converge(*one) for one in starts)]
+    candidates = [expected, *(converged(*one) for one in starts)]
     return min((c for c in candidates if c is not None), key=lambda found: found[1], default=(None, 0.0))[0]
 
 
@@ -145,7 +145,7 @@ def _sample_consensus(
     return [(se3.inverse(se3.make(cv2.Rodrigues(rotation)[0], translation)), inliers)]
 
 
-def _converge(
+def converge(
     T_odom_cam: NDArray[np.float64],
     inliers: NDArray[np.bool_],
     observations: Observations,
@@ -154,26 +154,44 @@ def _converge(
     threshold_px: float,
     pixel_sigma: float,
     minimum: int,
-    prediction: Prediction | None,
     votes: NDArray[np.float64],
+    prediction: Prediction | None = None,
 ) -> tuple[PoseEstimate, float] | None:
-    """Refine a pose on its inliers (N,), twice, as they change; return it with its truncated error, weighted."""
-    covariance = np.eye(6)
-    for _ in range(2):
-        try:
-            T_odom_cam, covariance = refine_pose(
-                T_odom_cam, observations[inliers], camera, pixel_sigma=pixel_sigma, prediction=prediction
-            )
-        except np.linalg.LinAlgError:  # landmarks on one line leave the rotation about it open
-            return None
-        errors, in_front = whitened_errors(T_odom_cam, observations, camera, pixel_sigma)
-        before, inliers = inliers, in_front & (errors < threshold_px)
-        if inliers.sum() < minimum:
-            return None
-        if (before == inliers).all():
-            break
-    score = float((votes * np.where(inliers, errors, threshold_px)).sum())
-    return PoseEstimate(T_odom_cam, inliers, float(np.median(errors[inliers])), covariance), score
+    """Refine a pose on its inliers (N,), and again on those it leads to where they are others.
+
+    Minimises robust pixel and inverse-depth errors by Gauss-Newton. What the uncertain distance of a landmark explains
+    of an error is taken off. Returns the estimate with its error, truncated and weighted by ``votes`` (N,), or None
+    where the landmarks do not determine the pose or fewer than ``minimum`` agree with it.
+    """
+    o = observations
+    found = native.converge(
+        np.ascontiguousarray(T_odom_cam),
+        inliers,
+        np.ascontiguousarray(o.landmarks),
+        np.ascontiguousarray(o.pixels),
+        np.ascontiguousarray(o.inverse_depth),
+        np.ascontiguousarray(o.inverse_sigma),
+        None if o.spread is None else np.ascontiguousarray(o.spread),
+        None if o.origin is None else np.ascontiguousarray(o.origin),
+        votes,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        pixel_sigma,
+        None if prediction is None else np.ascontiguousarray(prediction.T_odom_cam[:3, 3]),
+        1.0 if prediction is None else prediction.sigma_m,
+        threshold_px,
+        NEAREST_M,
+        minimum,
+        ITERATIONS,
+        CONVERGED,
+    )
+    if found is None:
+        return None
+    T, H, inliers, noise, reprojection_px, score = found
+    try:
+        covariance = np.linalg.inv(H) * max(1.0, noise / RAYLEIGH_MEDIAN) ** 2
+    except np.linalg.LinAlgError:  # landmarks on one line leave the rotation about it open
+        return None
+    return PoseEstimate(T, inliers, reprojection_px, covariance), score
 
 
 def _as_good_as_exact(
@@ -191,69 +209,6 @@ def _as_good_as_exact(
     _, J_point = residuals_and_jacobian(in_cam, observations, camera, pixel_sigma)
     shift = shift_of_distance(prediction.T_odom_cam, in_cam, observations, J_point)
     return np.flatnonzero(np.linalg.norm(shift, axis=1) * pixel_sigma < 0.5 * threshold_px)
-
-
-def whitened_errors(
-    T_odom_cam: NDArray[np.float64], observations: Observations, camera: Camera, pixel_sigma: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the distances (N,) in pixels of landmarks from where they are seen, and which are in front.
-
-    What an uncertain distance explains of an error is taken off.
-    """
-    errors, in_front = native.pixel_errors(
-        np.ascontiguousarray(T_odom_cam), *_arrays(observations), _intrinsics(camera), pixel_sigma, NEAREST_M
-    )
-    return errors * pixel_sigma, in_front
-
-
-def refine_pose(
-    T_odom_cam: NDArray[np.float64],
-    observations: Observations,
-    camera: Camera,
-    *,
-    pixel_sigma: float,
-    prediction: Prediction | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Minimise robust pixel and inverse-depth errors over the pose; return it with its covariance (6, 6).
-
-    Raises numpy.linalg.LinAlgError when the landmarks do not determine the pose.
-    """
-    expected = None if prediction is None else np.ascontiguousarray(prediction.T_odom_cam[:3, 3])
-    refined = native.refine_pose(
-        np.ascontiguousarray(T_odom_cam),
-        *_arrays(observations),
-        _intrinsics(camera),
-        pixel_sigma,
-        expected,
-        1.0 if prediction is None else prediction.sigma_m,
-        ITERATIONS,
-        CONVERGED,
-    )
-    if refined is None:
-        raise np.linalg.LinAlgError("the landmarks do not determine the pose")
-    T, H, errors = refined
-    spread = float(np.median(errors)) / 1.1774  # sigma of a Rayleigh median
-    return se3.orthonormalise(T), np.asarray(np.linalg.inv(H) * max(1.0, spread) ** 2, np.float64)
-
-
-_Arrays: TypeAlias = tuple[Array, Array, Array, Array, Array | None, Array | None]
-
-
-def _arrays(observations: Observations) -> _Arrays:
-    """Return landmarks, pixels, inverse depths, their sigmas, spread and origin as the kernels take them."""
-    o = observations
-    return (
-        np.ascontiguousarray(o.landmarks),
-        np.ascontiguousarray(o.pixels),
-        np.ascontiguousarray(o.inverse_depth),
-        np.ascontiguousarray(o.inverse_sigma),
-        None if o.spread is None else np.ascontiguousarray(o.spread),
-        None if o.origin is None else np.ascontiguousarray(o.origin),
-    )
-
-
-def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
-    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def motion_covariance(

@@ -178,6 +178,7 @@ void follow(const Pyramid& before, const Pyramid& after, const float* points, in
         likeness[i] = 0;
         if (!descend(before, after, begin, end, settings.top, settings, kernels, model, likeness + i)) continue;
         there[0] = end.x, there[1] = end.y;
+        if (likeness[i] < settings.least_likeness) continue;  // another patch: no matter where it came from
         if (!descend(after, before, end, back, settings.back_top, settings, kernels, model, nullptr)) continue;
         round_trip[i] = std::sqrt((back.x - begin.x) * (back.x - begin.x) + (back.y - begin.y) * (back.y - begin.y));
     }

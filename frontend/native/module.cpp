@@ -133,7 +133,7 @@ std::vector<std::string> levels() {
 
 std::tuple<Out<float, -1, 2>, Out<float, -1>, Out<float, -1>> followed(
     const Pyramid& before, const Pyramid& after, const Pixels& points, const Pixels& start, int side, int top,
-    int back_top, const std::optional<std::string>& level, bool level_out) {
+    int back_top, const std::optional<std::string>& level, bool level_out, float least_likeness) {
     const size_t n = points.shape(0);
     require(start.shape(0) == n, "each point needs a start");
     require(side >= 5 && side <= kMaxSide && side % 2 == 1, "the side of a patch is odd, from 5 to 29");
@@ -141,7 +141,7 @@ std::tuple<Out<float, -1, 2>, Out<float, -1>, Out<float, -1>> followed(
     std::vector<float> there(start.data(), start.data() + 2 * n), round_trip(n), likeness(n);
     {
         nb::gil_scoped_release free;
-        follow(before, after, points.data(), static_cast<int64_t>(n), {side / 2, top, back_top, level_out}, kernels, there.data(),
+        follow(before, after, points.data(), static_cast<int64_t>(n), {side / 2, top, back_top, level_out, least_likeness}, kernels, there.data(),
                round_trip.data(), likeness.data());
     }
     return {give<float, -1, 2>(std::move(there), {n, 2}), give<float, -1>(std::move(round_trip), {n}),
@@ -169,41 +169,34 @@ Landmarks landmarks_of(const Points& positions, const std::optional<Vector>& spr
     return {positions.data(), spread ? spread->data() : nullptr, spread ? origin->data() : nullptr};
 }
 
-std::optional<std::tuple<Out<double, 4, 4>, Out<double, 6, 6>, Out<double, -1>>> refined(
-    const Pose& T, const Points& positions, const In<double, -1, 2>& pixels, const Vector& inverse_depth,
-    const Vector& inverse_sigma, const std::optional<Vector>& spread, const std::optional<In<double, 3>>& origin,
-    const Four& camera, double pixel_sigma, const std::optional<In<double, 3>>& expected, double sigma_m,
-    int iterations, double converged) {
-    const size_t n = positions.shape(0);
-    const Seen seen = seen_of(pixels, inverse_depth, inverse_sigma, n);
-    const Landmarks landmarks = landmarks_of(positions, spread, origin);
-    const Expected prior = {expected ? expected->data() : nullptr, sigma_m};
-    std::vector<double> pose(T.data(), T.data() + 16), H(36), errors(n);
-    bool determined = false;
-    {
-        nb::gil_scoped_release free;
-        determined = refine_pose(pose.data(), landmarks, seen, lens_of(camera, pixel_sigma), prior, iterations,
-                                 converged, H.data(), errors.data());
-    }
-    if (!determined) return std::nullopt;
-    return std::make_tuple(give<double, 4, 4>(std::move(pose), {4, 4}), give<double, 6, 6>(std::move(H), {6, 6}),
-                           give<double, -1>(std::move(errors), {n}));
-}
+using Mask = nb::ndarray<const bool, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Converged = std::tuple<Out<double, 4, 4>, Out<double, 6, 6>, Flags, double, double, double>;
 
-std::tuple<Out<double, -1>, Flags> errors_of(
-    const Pose& T, const Points& positions, const In<double, -1, 2>& pixels, const Vector& inverse_depth,
-    const Vector& inverse_sigma, const std::optional<Vector>& spread, const std::optional<In<double, 3>>& origin,
-    const Four& camera, double pixel_sigma, double nearest_m) {
+std::optional<Converged> converged_from(
+    const Pose& T, const Mask& inliers, const Points& positions, const In<double, -1, 2>& pixels,
+    const Vector& inverse_depth, const Vector& inverse_sigma, const std::optional<Vector>& spread,
+    const std::optional<In<double, 3>>& origin, const Vector& votes, const Four& camera, double pixel_sigma,
+    const std::optional<In<double, 3>>& expected, double sigma_m, double threshold_px, double nearest_m,
+    int64_t minimum, int iterations, double least_step) {
     const size_t n = positions.shape(0);
     const Seen seen = seen_of(pixels, inverse_depth, inverse_sigma, n);
     const Landmarks landmarks = landmarks_of(positions, spread, origin);
-    std::vector<double> errors(n);
-    auto* in_front = new bool[n];
+    require(inliers.shape(0) == n && votes.shape(0) == n, "each landmark is an inlier or not, and has a vote");
+    require(minimum > 0, "a pose needs landmarks");
+    const PoseSettings settings = {lens_of(camera, pixel_sigma), {expected ? expected->data() : nullptr, sigma_m},
+                                   threshold_px, nearest_m, minimum, iterations, least_step};
+    ConvergedPose pose;
+    std::copy(T.data(), T.data() + 16, pose.T);
+    pose.inliers.assign(inliers.data(), inliers.data() + n);
     {
         nb::gil_scoped_release free;
-        pixel_errors(T.data(), landmarks, seen, lens_of(camera, pixel_sigma), nearest_m, errors.data(), in_front);
+        if (!converge(landmarks, seen, votes.data(), settings, pose)) return std::nullopt;
     }
-    return {give<double, -1>(std::move(errors), {n}), give_flags(in_front, n)};
+    auto* flags = new bool[n];
+    std::copy(pose.inliers.begin(), pose.inliers.end(), flags);
+    return Converged(give<double, 4, 4>(std::vector<double>(pose.T, pose.T + 16), {4, 4}),
+                     give<double, 6, 6>(std::vector<double>(pose.H, pose.H + 36), {6, 6}), give_flags(flags, n),
+                     pose.noise, pose.error_px, pose.score);
 }
 
 std::tuple<Out<float, -1, 5>, Out<uint8_t, -1, kDescriptor>> sift_of(const Rows& image, const std::optional<Grey>& mask,
@@ -276,7 +269,7 @@ NB_MODULE(_native, m) {
         .def_prop_ro("grey", [](const Pyramid& self) { return level_of(self, 0); })
         .def("level", &level_of, "level"_a);
     m.def("follow", &followed, "before"_a, "after"_a, "points"_a, "start"_a, "side"_a, "top"_a, "back_top"_a,
-          "level"_a = nb::none(), "level_out"_a = true);
+          "level"_a = nb::none(), "level_out"_a = true, "least_likeness"_a = -1.0f);
     m.def("strongest", &strongest_of, "image"_a.noconvert(), "cell"_a, "border"_a, "harris_k"_a, "mask"_a.noconvert().none());
     m.def("median_difference", [](const Rows& image) { return median_difference(level_with(image)); },
           "image"_a.noconvert());
@@ -294,11 +287,10 @@ NB_MODULE(_native, m) {
         [](const Pyramid& source, const Pyramid& target, const Pixels& points, const Pixels& start,
            const In<float, -1, 2, 2>& unwarp) { return aligned(align_warped, source, target, points, start, unwarp); },
         "source"_a, "target"_a, "points"_a, "start"_a, "unwarp"_a);
-    m.def("refine_pose", &refined, "T_odom_cam"_a, "landmarks"_a, "pixels"_a, "inverse_depth"_a, "inverse_sigma"_a,
-          "spread"_a.none(), "origin"_a.none(), "camera"_a, "pixel_sigma"_a, "expected"_a.none(), "sigma_m"_a,
-          "iterations"_a, "converged"_a);
-    m.def("pixel_errors", &errors_of, "T_odom_cam"_a, "landmarks"_a, "pixels"_a, "inverse_depth"_a, "inverse_sigma"_a,
-          "spread"_a.none(), "origin"_a.none(), "camera"_a, "pixel_sigma"_a, "nearest_m"_a);
+    m.def("converge", &converged_from, "T_odom_cam"_a, "inliers"_a, "landmarks"_a, "pixels"_a, "inverse_depth"_a,
+          "inverse_sigma"_a, "spread"_a.none(), "origin"_a.none(), "votes"_a, "camera"_a, "pixel_sigma"_a,
+          "expected"_a.none(), "sigma_m"_a, "threshold_px"_a, "nearest_m"_a, "minimum"_a, "iterations"_a,
+          "least_step"_a);
     m.def("adjust", &adjusted, "poses"_a, "n_fixed"_a, "landmarks"_a, "keyframe_of"_a, "landmark_of"_a, "pixels"_a,
           "inverse_depth"_a, "inverse_sigma"_a, "camera"_a, "pixel_sigma"_a, "offset"_a, "offset_information"_a,
           "iterations"_a, "damping"_a, "least_decrease"_a);

@@ -8,6 +8,9 @@
 namespace seamark {
 namespace {
 
+constexpr int kRounds = 2;      // the inliers of a refined pose are others
+constexpr int kPolarSteps = 3;  // each squares the error
+
 // Whitens pixel rows whose covariance is 1 + shift shift^T, shift being what one sigma of distance does to the pixel.
 SEAMARK_INLINE void discount(const double* T, const Landmarks& landmarks, int64_t i, const double* in_cam,
                              Residual& at) {
@@ -27,8 +30,8 @@ SEAMARK_INLINE void discount(const double* T, const Landmarks& landmarks, int64_
     }
 }
 
-}  // namespace
-
+// Refines T (4, 4) by at most `iterations` robust Gauss-Newton steps. Writes the normal matrix H (6, 6) of the last
+// step and the whitened pixel error (N,) before it. Returns false when the landmarks do not determine the pose.
 SEAMARK_CLONES bool refine_pose(double* T, const Landmarks& landmarks, const Seen& seen, const Lens& lens,
                                 const Expected& expected, int iterations, double converged, double* H,
                                 double* errors) {
@@ -76,8 +79,10 @@ SEAMARK_CLONES bool refine_pose(double* T, const Landmarks& landmarks, const See
     return true;
 }
 
+// Writes the whitened pixel error (N,) of landmarks seen from T (4, 4), less what their spread explains, and whether
+// they are at least `nearest_m` in front; those that are not are taken for the point (0, 0, 1) of the camera.
 SEAMARK_CLONES void pixel_errors(const double* T, const Landmarks& landmarks, const Seen& seen, const Lens& lens,
-                                 double nearest_m, double* errors, bool* in_front) {
+                                 double nearest_m, double* errors, char* in_front) {
     for (int64_t i = 0; i < seen.n; ++i) {
         double p[3];
         Residual at;
@@ -88,6 +93,84 @@ SEAMARK_CLONES void pixel_errors(const double* T, const Landmarks& landmarks, co
         if (landmarks.spread) discount(T, landmarks, i, p, at);
         errors[i] = std::sqrt(at.r[0] * at.r[0] + at.r[1] * at.r[1]);
     }
+}
+
+// Observations of some landmarks, side by side.
+struct Selected {
+    std::vector<double> positions, pixels, inverse_depth, inverse_sigma, spread;
+    Landmarks landmarks;
+    Seen seen;
+
+    void take(const Landmarks& from, const Seen& of, const std::vector<char>& which) {
+        positions.clear(), pixels.clear(), inverse_depth.clear(), inverse_sigma.clear(), spread.clear();
+        for (int64_t i = 0; i < of.n; ++i) {
+            if (!which[i]) continue;
+            positions.insert(positions.end(), from.positions + 3 * i, from.positions + 3 * i + 3);
+            pixels.insert(pixels.end(), of.pixels + 2 * i, of.pixels + 2 * i + 2);
+            inverse_depth.push_back(of.inverse_depth[i]), inverse_sigma.push_back(of.inverse_sigma[i]);
+            if (from.spread) spread.push_back(from.spread[i]);
+        }
+        landmarks = {positions.data(), from.spread ? spread.data() : nullptr, from.origin};
+        seen = {static_cast<int64_t>(inverse_depth.size()), pixels.data(), inverse_depth.data(), inverse_sigma.data()};
+    }
+};
+
+// The mean of the two in the middle where their number is even.
+double median(std::vector<double>& values) {
+    const size_t half = values.size() / 2;
+    std::nth_element(values.begin(), values.begin() + half, values.end());
+    if (values.size() % 2) return values[half];
+    return 0.5 * (values[half] + *std::max_element(values.begin(), values.begin() + half));
+}
+
+// Newton's iteration for the rotation nearest to that of T, as in frontend/se3.py.
+void orthonormalise(double* T) {
+    for (int step = 0; step < kPolarSteps; ++step) {
+        double fix[3][3], R[3][3];
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                fix[i][j] = (i == j ? 1.5 : 0) - 0.5 * (T[i] * T[j] + T[4 + i] * T[4 + j] + T[8 + i] * T[8 + j]);
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                R[i][j] = T[4 * i] * fix[0][j] + T[4 * i + 1] * fix[1][j] + T[4 * i + 2] * fix[2][j];
+        for (int i = 0; i < 3; ++i) std::copy(R[i], R[i] + 3, T + 4 * i);
+    }
+}
+
+}  // namespace
+
+bool converge(const Landmarks& landmarks, const Seen& seen, const double* votes, const PoseSettings& settings,
+              ConvergedPose& state) {
+    Selected chosen;
+    std::vector<double> errors(seen.n), some;
+    std::vector<char> before, in_front(seen.n);
+    for (int round = 0; round < kRounds; ++round) {
+        chosen.take(landmarks, seen, state.inliers);
+        if (chosen.seen.n < settings.minimum) return false;
+        some.resize(chosen.seen.n);
+        if (!refine_pose(state.T, chosen.landmarks, chosen.seen, settings.lens, settings.expected, settings.iterations,
+                         settings.converged, state.H, some.data()))
+            return false;
+        state.noise = median(some);
+        orthonormalise(state.T);
+        pixel_errors(state.T, landmarks, seen, settings.lens, settings.nearest_m, errors.data(), in_front.data());
+        before = state.inliers;
+        int64_t n = 0;
+        for (int64_t i = 0; i < seen.n; ++i) {
+            errors[i] *= settings.lens.pixel_sigma;
+            n += state.inliers[i] = in_front[i] && errors[i] < settings.threshold_px;
+        }
+        if (n < settings.minimum) return false;
+        if (before == state.inliers) break;
+    }
+    some.clear();
+    state.score = 0;
+    for (int64_t i = 0; i < seen.n; ++i) {
+        state.score += votes[i] * (state.inliers[i] ? errors[i] : settings.threshold_px);
+        if (state.inliers[i]) some.push_back(errors[i]);
+    }
+    state.error_px = median(some);
+    return true;
 }
 
 }  // namespace seamark

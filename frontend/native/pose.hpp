@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 #include "seen.hpp"
 
@@ -18,14 +19,26 @@ struct Expected {
     double sigma_m;
 };
 
-// Refines T (4, 4) by at most `iterations` robust Gauss-Newton steps. Writes the normal matrix H (6, 6) of the last
-// step and the whitened pixel error (N,) before it. Returns false when the landmarks do not determine the pose.
-bool refine_pose(double* T, const Landmarks& landmarks, const Seen& seen, const Lens& lens, const Expected& expected,
-                 int iterations, double converged, double* H, double* errors);
+struct PoseSettings {
+    Lens lens;
+    Expected expected;
+    double threshold_px, nearest_m;  // what an inlier is
+    int64_t minimum;                 // of them
+    int iterations;                  // robust Gauss-Newton steps at most
+    double converged;                // the length of a step that is the last
+};
 
-// Writes the whitened pixel error (N,) of landmarks seen from T (4, 4), less what their spread explains, and whether
-// they are at least `nearest_m` in front; those that are not are taken for the point (0, 0, 1) of the camera.
-void pixel_errors(const double* T, const Landmarks& landmarks, const Seen& seen, const Lens& lens, double nearest_m,
-                  double* errors, bool* in_front);
+struct ConvergedPose {
+    double T[16], H[36];          // the pose (4, 4) and the normal matrix (6, 6) of its last step
+    std::vector<char> inliers;    // (N,)
+    double noise;                 // median whitened error of what it was refined on
+    double error_px;              // median error of the inliers
+    double score;                 // sum of all errors, truncated at the threshold, times their votes
+};
+
+// Refines T (4, 4) on the inliers (N,) that `state` comes with, then on those it leads to, if they are others. `votes` (N,)
+// weigh the score. Returns false where the landmarks do not determine the pose or fewer than the minimum agree with it.
+bool converge(const Landmarks& landmarks, const Seen& seen, const double* votes, const PoseSettings& settings,
+              ConvergedPose& state);
 
 }  // namespace seamark

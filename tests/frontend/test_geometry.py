@@ -9,7 +9,7 @@ from seamark.frontend import se3
 from seamark.frontend.camera import CalibrationError, Camera, Rig
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth_offset import DepthOffset
-from seamark.frontend.pose import Prediction, estimate_pose, refine_pose
+from seamark.frontend.pose import Prediction, converge, estimate_pose
 from seamark.frontend.presumed import SPREAD, presume
 from seamark.frontend.pyramid import pyramid_of
 from seamark.frontend.residuals import Observations, residuals_and_jacobian
@@ -125,7 +125,7 @@ def test_landmarks_that_do_not_determine_a_pose_give_none(monkeypatch: pytest.Mo
     observations = Observations(points, see(np.eye(4), points), unknown(120), unknown(120))
     settings = {"threshold_px": 2.5, "iterations": 150, "pixel_sigma": 0.7, "minimum": 15}
     assert estimate_pose(observations, CAMERA, **settings) is not None
-    monkeypatch.setattr("seamark.frontend.pose.native.refine_pose", lambda *_: None)
+    monkeypatch.setattr("seamark.frontend.pose.native.converge", lambda *_: None)
     assert estimate_pose(observations, CAMERA, **settings) is None
 
 
@@ -258,8 +258,18 @@ def test_landmarks_of_uncertain_distance_hold_the_rotation() -> None:
     assert 0 < translation < 0.02
     assert estimate.inliers.sum() > 100
     assert np.trace(estimate.covariance[:3, :3]) < 0.3 * np.trace(six.covariance[:3, :3])
-    untold = refine_pose(true, replace(told, spread=None), CAMERA, pixel_sigma=0.3)[0]
-    assert errors(untold)[1] > 0.02
+    untold = converge(
+        true,
+        np.ones(120, bool),
+        replace(told, spread=None),
+        CAMERA,
+        threshold_px=1e9,
+        pixel_sigma=0.3,
+        minimum=6,
+        votes=np.ones(120),
+    )
+    assert untold is not None
+    assert errors(untold[0].T_odom_cam)[1] > 0.02
 
 
 def test_distances_are_presumed_from_what_is_seen_beside() -> None:

@@ -12,7 +12,7 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.kernels import native
 from seamark.frontend.patches import align_along, align_warped
-from seamark.frontend.pose import Prediction, refine_pose, whitened_errors
+from seamark.frontend.pose import Prediction, converge
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.residuals import Observations, residuals_and_jacobian, shift_of_distance
 from seamark.frontend.window import INITIAL_DAMPING, RELATIVE_DECREASE, BundleProblem, adjust
@@ -181,8 +181,12 @@ def test_pose_is_where_the_equations_of_numpy_are_at_rest(seed: int) -> None:
     prediction = Prediction(se3.make(np.eye(3), true[:3, 3] + 0.05), 0.1)
     start = true @ se3.make(se3.exp_rotation(np.array([0.02, -0.03, 0.01])), np.array([0.08, -0.05, 0.04]))
     T = start
+    votes = np.random.default_rng(seed).uniform(0.5, 2, len(o.landmarks))
+    settings = {"threshold_px": 1e9, "pixel_sigma": 0.7, "minimum": 6, "prediction": prediction, "votes": votes}
     for _ in range(4):  # robust weights converge slowly
-        T, covariance = refine_pose(T, o, CAMERA, pixel_sigma=0.7, prediction=prediction)
+        found = converge(T, np.ones(len(votes), bool), o, CAMERA, **settings)
+        assert found is not None
+        T, covariance = found[0].T_odom_cam, found[0].covariance
     in_cam, residuals, J_point = whitened(T, o)
     J, w = J_point @ by_pose(in_cam), weights_of(residuals)
     H, gradient = np.einsum("nka,nk,nkb->ab", J, w, J), np.einsum("nka,nk,nk->a", J, w, residuals)
@@ -192,9 +196,31 @@ def test_pose_is_where_the_equations_of_numpy_are_at_rest(seed: int) -> None:
     spread = max(1.0, np.median(np.linalg.norm(residuals[:, :2], axis=1)) / 1.1774)
     np.testing.assert_allclose(covariance, np.linalg.inv(H) * spread**2, rtol=1e-3, atol=1e-3 * covariance.max())
     assert 0 < np.linalg.norm(T[:3, 3] - true[:3, 3]) < 0.03
-    errors, in_front = whitened_errors(T, o, CAMERA, 0.7)
-    np.testing.assert_allclose(errors, 0.7 * np.linalg.norm(residuals[:, :2], axis=1), rtol=1e-9)
-    assert in_front.all()
+    errors = 0.7 * np.linalg.norm(residuals[:, :2], axis=1)
+    assert found[0].inliers.all()
+    np.testing.assert_allclose([found[0].reprojection_px, found[1]], [np.median(errors), votes @ errors], rtol=1e-9)
+
+
+def test_a_pose_is_refined_again_on_the_inliers_it_leads_to() -> None:
+    """Test: one in ten 8 px off, one landmark behind. Expected: the inliers are what numpy finds within the threshold of
+    the pose, the rest cost the threshold each, and too few of them are no pose.
+    """
+    true, o = scene(7)
+    o.landmarks[3] = true[:3, 3] - true[:3, 2]
+    everybody, votes = np.ones(len(o.landmarks), bool), np.random.default_rng(1).uniform(0.5, 2, len(o.landmarks))
+    settings = {"threshold_px": 2.0, "pixel_sigma": 0.7, "votes": votes}
+    found = converge(true, everybody, o, CAMERA, minimum=50, **settings)
+    assert found is not None
+    estimate, score = found
+    errors = 0.7 * np.linalg.norm(whitened(estimate.T_odom_cam, o)[1][:, :2], axis=1)
+    expected = (errors < 2.0) & (np.arange(len(errors)) != 3)
+    np.testing.assert_array_equal(estimate.inliers, expected)
+    assert 0.8 * len(errors) < expected.sum() < len(errors) - 5
+    assert score == pytest.approx(votes[expected] @ errors[expected] + 2 * votes[~expected].sum(), rel=1e-9)
+    once = converge(estimate.T_odom_cam, estimate.inliers, o, CAMERA, minimum=50, **settings)
+    assert once is not None
+    np.testing.assert_allclose(once[0].T_odom_cam, estimate.T_odom_cam, atol=1e-4)
+    assert converge(true, everybody, o, CAMERA, minimum=int(expected.sum()) + 5, **settings) is None
 
 
 # --- the window --------------------------------------------------------------------------------------------------
