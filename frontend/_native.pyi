@@ -27,6 +27,7 @@ def follow(
     level: str | None = None,
     level_out: bool = True,
     least_likeness: float = -1.0,
+    reach: float = ...,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 def strongest(
     image: NDArray[np.uint8], cell: int, border: int, harris_k: float, mask: NDArray[np.uint8] | None

@@ -25,10 +25,12 @@ def track(
     levels: int,
     round_trip_px: float,
     min_correlation: float,
+    reach_px: float = np.inf,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Follow points (N, 2) from one image to another, starting at ``guess`` (N, 2) if given.
 
-    Returns the points (N, 2) float32 in ``after`` and which of them survive: found, inside the image, back within
+    Returns the points (N, 2) float32 in ``after`` and which of them survive: found within ``reach_px`` of their start,
+    inside the image, back within
     ``round_trip_px`` of where they came from when tracked backward, and with a patch whose zero-mean normalised
     correlation with the one it came from is at least ``min_correlation``.
     """
@@ -37,7 +39,16 @@ def track(
     side, back = window_px // 2 * 2 + 1, min(BACK_LEVELS, levels)
     changed = abs(_brightness(after) - _brightness(before)) > BRIGHTNESS_GREY
     there, round_trip, correlation = native.follow(
-        before, after, start, first, side, levels, back, level_out=changed, least_likeness=min_correlation
+        before,
+        after,
+        start,
+        first,
+        side,
+        levels,
+        back,
+        level_out=changed,
+        least_likeness=min_correlation,
+        reach=reach_px,
     )
     height, width = after.grey.shape
     inside = (there >= 0).all(axis=1) & (there <= [width - 1, height - 1]).all(axis=1)

@@ -73,6 +73,7 @@ def find_again(
         levels=LEVELS,
         round_trip_px=0.5 * config.flow_round_trip_px,
         min_correlation=config.flow_min_correlation,
+        reach_px=config.revisit_search_px,
     )
     ok &= np.linalg.norm(there - expected, axis=1) < config.revisit_search_px
     ok &= native.apart(there, live.pixels, CROWDED_PX, to_each_other=False)

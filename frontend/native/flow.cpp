@@ -30,6 +30,8 @@ struct Range {
     }
 };
 
+float distance(Point a, Point b) { return std::sqrt((a.x - b.x) * (a.x - b.x) + (a.y - b.y) * (a.y - b.y)); }
+
 bool inside(const Level& level, Point p) {
     return p.x >= 0 && p.y >= 0 && p.x < static_cast<float>(level.width) && p.y < static_cast<float>(level.height);
 }
@@ -48,8 +50,9 @@ public:
                      std::min(side_, from.height - 2 - y)};
     }
 
-    // Moves a point that is inside to where the patch is; returns false when it runs out of the image or is not held.
-    bool find(Point& there, double least_step, int steps) {
+    // Moves a point that is inside to where the patch is; returns false when it runs out of the image or of reach, or is not held.
+    bool find(Point& there, double least_step, int steps, float reach) {
+        const Point begin = there;
         double last_x = 0, last_y = 0;
         for (int k = 0; k < steps; ++k) {
             int64_t sums[3];
@@ -59,7 +62,7 @@ public:
             const double off = level_out_ ? sums[2] / pixels_ : 0, bx = sums[0] - off * slope_x_, by = sums[1] - off * slope_y_;
             const double step_x = (xy_ * by - yy_ * bx) / determinant_, step_y = (xy_ * bx - xx_ * by) / determinant_;
             there.x += static_cast<float>(step_x), there.y += static_cast<float>(step_y);
-            if (!inside(to_, there)) return false;
+            if (!inside(to_, there) || distance(there, begin) > reach) return false;
             if (step_x * step_x + step_y * step_y < least_step * least_step) return true;
             if (std::fabs(step_x + last_x) < 0.01 && std::fabs(step_y + last_y) < 0.01 && k > 0) {  // to and fro
                 there.x -= static_cast<float>(0.5 * step_x), there.y -= static_cast<float>(0.5 * step_y);
@@ -142,7 +145,8 @@ bool descend(const Pyramid& from, const Pyramid& to, Point of, Point& there, int
         const bool finest = level == 0;
         Search search(from[level], to[level], begin, settings, kernels, model);
         const bool precise = finest && likeness;
-        const bool found = search.find(at, precise ? kPreciseStep : kCoarseStep, precise ? kPreciseSteps : kCoarseSteps);
+        const bool found = search.find(at, precise ? kPreciseStep : kCoarseStep, precise ? kPreciseSteps : kCoarseSteps,
+                                       settings.reach * scale);
         if (!found && finest) return false;
         if (found) there = {at.x / scale, at.y / scale};
         if (precise) *likeness = search.likeness(at);
@@ -180,7 +184,7 @@ void follow(const Pyramid& before, const Pyramid& after, const float* points, in
         there[0] = end.x, there[1] = end.y;
         if (likeness[i] < settings.least_likeness) continue;  // another patch: no matter where it came from
         if (!descend(after, before, end, back, settings.back_top, settings, kernels, model, nullptr)) continue;
-        round_trip[i] = std::sqrt((back.x - begin.x) * (back.x - begin.x) + (back.y - begin.y) * (back.y - begin.y));
+        round_trip[i] = distance(back, begin);
     }
 }
 

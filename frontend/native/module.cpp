@@ -8,6 +8,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <limits>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -133,7 +134,8 @@ std::vector<std::string> levels() {
 
 std::tuple<Out<float, -1, 2>, Out<float, -1>, Out<float, -1>> followed(
     const Pyramid& before, const Pyramid& after, const Pixels& points, const Pixels& start, int side, int top,
-    int back_top, const std::optional<std::string>& level, bool level_out, float least_likeness) {
+    int back_top, const std::optional<std::string>& level, bool level_out, float least_likeness,
+    float reach) {
     const size_t n = points.shape(0);
     require(start.shape(0) == n, "each point needs a start");
     require(side >= 5 && side <= kMaxSide && side % 2 == 1, "the side of a patch is odd, from 5 to 29");
@@ -141,7 +143,7 @@ std::tuple<Out<float, -1, 2>, Out<float, -1>, Out<float, -1>> followed(
     std::vector<float> there(start.data(), start.data() + 2 * n), round_trip(n), likeness(n);
     {
         nb::gil_scoped_release free;
-        follow(before, after, points.data(), static_cast<int64_t>(n), {side / 2, top, back_top, level_out, least_likeness}, kernels, there.data(),
+        follow(before, after, points.data(), static_cast<int64_t>(n), {side / 2, top, back_top, level_out, least_likeness, reach}, kernels, there.data(),
                round_trip.data(), likeness.data());
     }
     return {give<float, -1, 2>(std::move(there), {n, 2}), give<float, -1>(std::move(round_trip), {n}),
@@ -269,7 +271,8 @@ NB_MODULE(_native, m) {
         .def_prop_ro("grey", [](const Pyramid& self) { return level_of(self, 0); })
         .def("level", &level_of, "level"_a);
     m.def("follow", &followed, "before"_a, "after"_a, "points"_a, "start"_a, "side"_a, "top"_a, "back_top"_a,
-          "level"_a = nb::none(), "level_out"_a = true, "least_likeness"_a = -1.0f);
+          "level"_a = nb::none(), "level_out"_a = true, "least_likeness"_a = -1.0f,
+          "reach"_a = std::numeric_limits<float>::infinity());
     m.def("strongest", &strongest_of, "image"_a.noconvert(), "cell"_a, "border"_a, "harris_k"_a, "mask"_a.noconvert().none());
     m.def("median_difference", [](const Rows& image) { return median_difference(level_with(image)); },
           "image"_a.noconvert());
