@@ -28,7 +28,7 @@ class FrontendConfig(BaseModel):
 
     # Motion
     pnp_threshold_px: float = Field(2.5, gt=0, description="reprojection error of a RANSAC inlier")
-    pnp_iterations: int = Field(150, ge=10, le=10000, description="RANSAC samples at most; recovery takes four times")
+    pnp_iterations: int = Field(100, ge=10, le=10000, description="RANSAC samples at most; recovery takes six times")
     pixel_sigma: float = Field(0.7, gt=0, description="standard deviation of a tracked corner in pixels")
     min_inliers: int = Field(15, ge=6, description="fewer inliers than this mean that the pose is not known")
     good_inliers: int = Field(40, ge=6, description="from this many inliers on the pose is GOOD, below MARGINAL")

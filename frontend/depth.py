@@ -72,18 +72,21 @@ class DepthImage:
         height, width = depth.shape
         x = np.clip(np.rint(points[:, 0]).astype(int), 1, width - 2)
         y = np.clip(np.rint(points[:, 1]).astype(int), 1, height - 2)
-        around = np.stack([depth[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]).astype(np.float64)
+        row = np.arange(-1, 2) * width
+        offsets = (row[:, None] + np.arange(-1, 2)).reshape(-1)
+        around = depth.reshape(-1)[(y * width + x)[:, None] + offsets].astype(np.float64)
         if depth.dtype == np.uint16:
             around /= self._depth_factor
         usable = np.isfinite(around) & (around > 0)
-        readings = usable.sum(axis=0)
-        around = np.sort(np.where(usable, around, np.inf), axis=0)
-        column = np.arange(len(points))
-        z = around[np.maximum(readings - 1, 0) // 2, column]
+        readings = usable.sum(axis=1)
+        around = np.sort(np.where(usable, around, np.inf), axis=1)
+        place = np.arange(len(points))
+        z = around[place, np.maximum(readings - 1, 0) // 2]
         c = self._config
         valid = (readings >= MIN_READINGS) & (z > c.depth_min_m) & (z < c.depth_max_m)
         z = np.where(valid, z, np.nan)
-        spread = np.where(valid, around[np.maximum(readings - 1, 0), column], 0) - np.where(valid, around[0], 0)
+        last = around[place, np.maximum(readings - 1, 0)]
+        spread = np.where(valid, last, 0) - np.where(valid, around[:, 0], 0)
         valid &= spread < np.maximum(EDGE_SPREAD * z, 4 * (c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2))
         z = np.where(valid, z, np.nan)
         sigma_z = c.depth_sigma_floor_m + c.depth_sigma_per_m2 * z**2

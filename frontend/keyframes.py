@@ -1,8 +1,8 @@
 """What a keyframe carries beyond its pose: SIFT, landmarks, JPEG, thumbnail; made in a thread beside tracking.
 
-SIFT costs as much as ten frames of tracking and OpenCV frees the interpreter while it works, so one plain thread
-keeps it off the frame's latency, and gives way where there is one core only. Keyframes come out in the order they went in; nothing that the tracker decides
-depends on when.
+SIFT costs as much as three frames of tracking and frees the interpreter while it works, so one plain thread keeps it
+off the frame's latency, and gives way where there is one core only. Keyframes come out in the order they went in;
+nothing that the tracker decides depends on when.
 """
 
 import os

@@ -124,7 +124,8 @@ class Frontend:
         if self._initialiser is not None:
             return self._initialise(session, self._initialiser, frame, image, tracks)
 
-        pose, keep = tracker.estimate(session, self._sensor, frame, tracks)
+        prediction = session.prediction()
+        pose, keep = tracker.estimate(session, self._sensor, frame, tracks, prediction)
         watch.lap("pose")
         if pose is None or tracker.abrupt(session, pose):
             recovered = self._recover(session, frame, image, pose)
@@ -133,7 +134,7 @@ class Frontend:
         if pose is None:
             return self._lose(session, frame, image)
         settled = tracker.settle(session, image, tracks, pose.T_odom_cam)
-        better, keep_better = tracker.estimate(session, self._sensor, frame, settled, pose)
+        better, keep_better = tracker.estimate(session, self._sensor, frame, settled, prediction, pose)
         if better is not None:
             pose, keep, tracks = better, keep_better, settled
         watch.lap("settle")

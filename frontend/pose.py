@@ -63,9 +63,10 @@ def estimate_pose(
 
     The prediction is refined first; where nearly all landmarks agree with what it leads to, that is the pose. Elsewhere
     P3P after Ke and Roumeliotis (2017) within RANSAC, then :func:`converge`. With a prediction, landmarks of uncertain
-    distance take part: they hold the rotation, and the translation across their line of sight. ``votes`` (N,) weigh the landmarks where they disagree: then what the others
-    agree on, and what is predicted, stand for election beside the largest consensus. A ``start``, the pose of the same
-    landmarks when their pixels were hardly different, is refined without sampling.
+    distance take part: they hold the rotation, and the translation across their line of sight. ``votes`` (N,) weigh the
+    landmarks where they disagree: then what the others agree on, and what is predicted, stand for election beside the
+    largest consensus. A ``start``, the pose of the same landmarks when their pixels were hardly different, is refined
+    without sampling.
     """
     if len(observations.landmarks) < max(4, minimum):
         return None

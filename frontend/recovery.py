@@ -52,7 +52,7 @@ def recover(
             Observations(landmarks, camera.undistort(seen), unknown, unknown, spread, origin),
             camera,
             threshold_px=config.pnp_threshold_px,
-            iterations=4 * config.pnp_iterations,
+            iterations=6 * config.pnp_iterations,
             pixel_sigma=config.pixel_sigma,
             minimum=MIN_INLIERS,
             prediction=prediction,

@@ -120,9 +120,11 @@ class Session:
 
     def distance(self) -> float:
         """Return the median distance of what is tracked, 1 where none is known."""
-        positions = self.landmarks.get(self.tracks.ids)
-        distance = np.linalg.norm(positions[np.isfinite(positions[:, 0])] - self.T_odom_cam[:3, 3], axis=1)
-        return float(np.median(distance)) if len(distance) else 1.0
+        away = self.landmarks.get(self.tracks.ids) - self.T_odom_cam[:3, 3]
+        squared = np.einsum("ij,ij->i", away, away)
+        squared = squared[np.isfinite(squared)]
+        middle = len(squared) // 2
+        return float(np.sqrt(np.partition(squared, middle)[middle])) if len(squared) else 1.0
 
     def motion_since(self, T_odom_a: NDArray[np.float64], estimate: PoseEstimate | None) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the motion from ``T_odom_a`` to the present pose, which was estimated so."""
@@ -290,14 +292,19 @@ class Session:
     ) -> tuple[BundleProblem | None, NDArray[np.int64]]:
         keyframe_of = np.concatenate([np.full(len(k.track_ids), i) for i, k in enumerate(views)])
         ids = np.concatenate([k.track_ids for k in views])
-        unique, landmark_of, count = np.unique(ids, return_inverse=True, return_counts=True)
-        positions = self.landmarks.get(unique)
-        wanted = np.isfinite(positions[:, 0]) & (count >= 2)
-        if wanted.sum() < self.config.min_inliers:
-            return None, unique
-        renumber = np.cumsum(wanted) - 1
-        use = np.flatnonzero(wanted[landmark_of])
-        use = use[np.argsort(landmark_of[use], kind="stable")]
+        first = ids.min()
+        count = np.bincount(ids - first)  # ids are given in turn: what a window sees lies close together
+        seen_often = np.flatnonzero(count >= 2)
+        positions = self.landmarks.get(seen_often + first)
+        known = np.isfinite(positions[:, 0])
+        track_ids, positions = seen_often[known] + first, positions[known]
+        if len(track_ids) < self.config.min_inliers:
+            return None, track_ids
+        number = np.full(len(count), -1, np.int32)
+        number[track_ids - first] = np.arange(len(track_ids))
+        landmark_of = number[ids - first]
+        use = np.flatnonzero(landmark_of >= 0)
+        use = use[np.argsort(landmark_of[use].astype(np.uint16 if len(track_ids) < 2**16 else np.int64), kind="stable")]
         pixels = np.vstack([k.pixels for k in views])[use]
         measured = Observations(
             landmarks=np.zeros((len(use), 3)),
@@ -308,10 +315,10 @@ class Session:
         problem = BundleProblem(
             poses=np.stack([k.T_odom_cam for k in views]),
             n_fixed=n_fixed,
-            landmarks=positions[wanted],
+            landmarks=positions,
             keyframe_of=keyframe_of[use],
-            landmark_of=renumber[landmark_of[use]],
+            landmark_of=landmark_of[use].astype(np.int64),
             measured=measured,
             depth_offset=self.depth_offset,
         )
-        return problem, unique[wanted]
+        return problem, track_ids

@@ -7,7 +7,7 @@ from seamark.frontend import flow, se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.depth import DepthImage, DepthSensor
 from seamark.frontend.patches import align_warped
-from seamark.frontend.pose import PoseEstimate, estimate_pose
+from seamark.frontend.pose import PoseEstimate, Prediction, estimate_pose
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.session import Session
 from seamark.frontend.static_votes import static_votes
@@ -81,11 +81,17 @@ def follow(session: Session, before: Pyramid, after: Pyramid, *, predict: bool) 
 
 
 def estimate(
-    session: Session, sensor: DepthSensor, frame: Frame, tracks: Tracks, start: PoseEstimate | None = None
+    session: Session,
+    sensor: DepthSensor,
+    frame: Frame,
+    tracks: Tracks,
+    prediction: Prediction,
+    start: PoseEstimate | None = None,
 ) -> tuple[PoseEstimate | None, NDArray[np.bool_]]:
     """Estimate the pose from the tracks with a landmark; returns it and which tracks (N,) it does not refute.
 
-    ``start`` is the pose of the same tracks before their pixels were settled.
+    ``prediction`` says where the camera is expected, ``start`` is the pose of the same tracks before their pixels were
+    settled.
     """
     c = session.config
     unknown = np.full(len(tracks), np.nan)
@@ -94,7 +100,7 @@ def estimate(
     reading = sensor.inverse_depth(frame, tracks.pixels) if isinstance(sensor, DepthImage) else (unknown, unknown)
     observations, known = session.observations(tracks, *reading)
     votes = static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera)
-    pose, prediction = None, session.prediction()
+    pose = None
     for threshold_px in dict.fromkeys((session.gate_px(), c.pnp_threshold_px)):  # once where they are the same
         pose = estimate_pose(
             observations,

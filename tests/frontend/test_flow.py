@@ -178,6 +178,34 @@ def test_points_go_where_numpy_says() -> None:
         assert round_trip[i] == pytest.approx(np.linalg.norm(back - points[i]), abs=0.1)
 
 
+def test_what_would_be_refused_is_not_searched_to_its_end() -> None:
+    """Test: half of the image is another; a least likeness, a reach. Expected: what is unlike is not followed back and
+    nothing else changes; what is farther than the reach is lost, what is nearer is where it was found without one.
+    """
+    image = texture(10)
+    other = moved(image, np.eye(2), SHIFT)
+    other[:, 160:] = texture(11)[:, 160:]
+    points = grid(30)
+    pair = pyramid_of(image, 2), pyramid_of(other, 2)
+    there, round_trip, likeness = native.follow(*pair, points, points, 21, 2, 1)
+    some = native.follow(*pair, points, points, 21, 2, 1, least_likeness=0.5)
+    unlike = likeness < 0.5
+    assert 0.3 < unlike.mean() < 0.7 and (likeness[unlike] != 0).any()
+    np.testing.assert_array_equal(some[0], there)
+    np.testing.assert_array_equal(some[1], np.where(unlike, np.inf, round_trip))
+
+    length = float(np.linalg.norm(SHIFT))
+    for reach, found in ((length - 1, False), (length + 3, True)):
+        at, back, _ = native.follow(*pair, points, points, 21, 0, 0, reach=reach)
+        free, back_free, _ = native.follow(*pair, points, points, 21, 0, 0)
+        left = (points[:, 0] < 130) & (np.linalg.norm(free - points - SHIFT, axis=1) < 0.2) & (back_free < 0.2)
+        assert left.sum() > 20
+        assert (np.linalg.norm(at - points, axis=1) <= reach + 0.01).all()
+        assert np.isfinite(back[left]).mean() == pytest.approx(float(found), abs=0.1)
+        same = np.isfinite(back) & left
+        np.testing.assert_array_equal(at[same], free[same])
+
+
 def test_points_go_where_opencv_sends_them() -> None:
     image = texture(8)
     other = moved(image, np.eye(2), SHIFT)

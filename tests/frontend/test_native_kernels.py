@@ -202,8 +202,8 @@ def test_pose_is_where_the_equations_of_numpy_are_at_rest(seed: int) -> None:
 
 
 def test_a_pose_is_refined_again_on_the_inliers_it_leads_to() -> None:
-    """Test: one in ten 8 px off, one landmark behind. Expected: the inliers are what numpy finds within the threshold of
-    the pose, the rest cost the threshold each, and too few of them are no pose.
+    """Test: one in ten 8 px off, one landmark behind. Expected: the inliers are what numpy finds within the threshold
+    of the pose, the rest cost the threshold each, and too few of them are no pose.
     """
     true, o = scene(7)
     o.landmarks[3] = true[:3, 3] - true[:3, 2]
