@@ -189,7 +189,7 @@ def converge(
         return None
     T, H, inliers, noise, reprojection_px, score = found
     try:
-        covariance = np.linalg.inv(H) * max(1.0, noise / RAYLEIGH_MEDIAN) ** 2
+        covariance = np.asarray(np.linalg.inv(H) * max(1.0, noise / RAYLEIGH_MEDIAN) ** 2, np.float64)
     except np.linalg.LinAlgError:  # landmarks on one line leave the rotation about it open
         return None
     return PoseEstimate(T, inliers, reprojection_px, covariance), score
