@@ -156,17 +156,27 @@ class OdometryChains:
 
 def white_covariance(node: Node, motion: Matrix, config: DriftConfig) -> Matrix:
     """Return the covariance (6, 6) of one motion that stands for noise and bias in a graph of white noise."""
-    if node.span is not None:
-        return _symmetric(config.covariance_inflation * node.covariance + node.span.drift)
-    translation = config.translation_fraction if node.metric else config.mono_translation_fraction
-    turning = config.rotation_fraction * float(se3.rotation_angle(motion[:3, :3])) + np.deg2rad(
-        config.rotation_deg_per_keyframe
+    return white_covariances([node], motion[None], config)[0]
+
+
+def white_covariances(nodes: Sequence[Node], motions: Matrix, config: DriftConfig) -> Matrix:
+    """Return the covariances (N, 6, 6) of motions (N, 4, 4) that stand for noise and bias in a graph of white noise."""
+    metric = np.array([node.metric for node in nodes], bool)
+    lengths = np.linalg.norm(motions[:, :3, 3], axis=1)
+    angles = se3.rotation_angle(motions[:, :3, :3])
+    turning = config.rotation_fraction * angles + np.deg2rad(config.rotation_deg_per_keyframe)
+    moving = np.where(metric, config.translation_fraction, config.mono_translation_fraction) * lengths
+    floor = np.maximum(np.where(metric, config.floor_translation_m, 1e-3 * lengths), 1e-6)
+    horizon = config.horizon_keyframes
+    variances = np.stack(
+        [turning**2 * horizon + np.deg2rad(config.floor_rotation_deg) ** 2, moving**2 * horizon + floor**2]
     )
-    bias = np.repeat([turning, translation * float(np.linalg.norm(motion[:3, 3]))], 3)
-    floor_translation = config.floor_translation_m if node.metric else 1e-3 * float(np.linalg.norm(motion[:3, 3]))
-    floor = np.repeat([np.deg2rad(config.floor_rotation_deg), max(floor_translation, 1e-6)], 3)
-    variances = bias**2 * config.horizon_keyframes + floor**2
-    return _symmetric(config.covariance_inflation * node.covariance + np.diag(variances))
+    drift = np.repeat(variances.T, 3, axis=1)[:, :, None] * np.eye(6)
+    for row, node in enumerate(nodes):
+        if node.span is not None:
+            drift[row] = node.span.drift
+    out = config.covariance_inflation * np.stack([node.covariance for node in nodes]) + drift
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
 
 def adjoint_stack(T: NDArray[np.floating]) -> Matrix:
@@ -183,7 +193,3 @@ def adjoint_stack(T: NDArray[np.floating]) -> Matrix:
     out[:, 3:, :3] = hat @ R
     out[:, 3:, 3:] = scaled
     return out
-
-
-def _symmetric(covariance: Matrix) -> Matrix:
-    return np.asarray(0.5 * (covariance + covariance.T))

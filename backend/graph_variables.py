@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.chain import white_covariance
 from seamark.backend.config import DriftConfig, GraphConfig
 from seamark.backend.consistency import similarity
 from seamark.backend.graph_types import Constraint, Node
@@ -37,9 +36,9 @@ class PoseVariables:
         noise = gtsam.noiseModel.Isotropic.Sigma(6, self._config.prior_sigma)
         return gtsam.PriorFactorPose3(keyframe_id, self.value(M), noise)
 
-    def odometry(self, previous_id: int, node: Node, motion: Matrix) -> gtsam.NonlinearFactor:
+    def odometry(self, previous_id: int, node: Node, motion: Matrix, covariance: Matrix) -> gtsam.NonlinearFactor:
         """Join a keyframe with its predecessor."""
-        noise = self._gaussian(white_covariance(node, motion, self._drift))
+        noise = self._gaussian(covariance)
         return gtsam.BetweenFactorPose3(previous_id, node.id, self.value(motion), noise)
 
     def loop(self, constraint: Constraint) -> gtsam.NonlinearFactor:
@@ -88,9 +87,9 @@ class PlanarVariables(PoseVariables):
         noise = gtsam.noiseModel.Isotropic.Sigma(3, self._config.prior_sigma)
         return gtsam.PriorFactorPose2(keyframe_id, self.value(M), noise)
 
-    def odometry(self, previous_id: int, node: Node, motion: Matrix) -> gtsam.NonlinearFactor:
+    def odometry(self, previous_id: int, node: Node, motion: Matrix, covariance: Matrix) -> gtsam.NonlinearFactor:
         """Join a keyframe with its predecessor."""
-        noise = self._gaussian(white_covariance(node, motion, self._drift))
+        noise = self._gaussian(covariance)
         return gtsam.BetweenFactorPose2(previous_id, node.id, self.value(motion), noise)
 
     def loop(self, constraint: Constraint) -> gtsam.NonlinearFactor:
@@ -131,11 +130,11 @@ class SimilarityVariables(PoseVariables):
         noise = gtsam.noiseModel.Isotropic.Sigma(7, self._config.prior_sigma)
         return gtsam.PriorFactorSimilarity3(keyframe_id, self.value(M), noise)
 
-    def odometry(self, previous_id: int, node: Node, motion: Matrix) -> gtsam.NonlinearFactor:
+    def odometry(self, previous_id: int, node: Node, motion: Matrix, covariance: Matrix) -> gtsam.NonlinearFactor:
         """Join a keyframe with its predecessor; the scale may drift where the session is not metric."""
         scale_sigma = 1e-4 if node.metric else self._drift.scale_per_keyframe
         scale_sigma *= 1.0 if node.span is None else node.span.steps**0.5
-        noise = _with_scale(white_covariance(node, motion, self._drift), scale_sigma)
+        noise = _with_scale(covariance, scale_sigma)
         return gtsam.BetweenFactorSimilarity3(previous_id, node.id, self.value(motion), noise)
 
     def loop(self, constraint: Constraint) -> gtsam.NonlinearFactor:

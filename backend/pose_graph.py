@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.chain import white_covariances
 from seamark.backend.config import BackendConfig, DriftConfig, GraphConfig
 from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.errors import BackendInputError, SolverError
@@ -222,15 +223,22 @@ class PoseGraph:
         self._poses[order] = poses
         self._new_loops.clear()
 
-    def _factors(self, rows: Iterable[int], loops: Iterable[Key]) -> gtsam.NonlinearFactorGraph:
+    def _factors(self, rows: Sequence[int], loops: Iterable[Key]) -> gtsam.NonlinearFactorGraph:
         """Return the factors that these keyframes and loops bring."""
         graph = gtsam.NonlinearFactorGraph()
+        joined = [row for row in rows if self._before[row] >= 0]
         for row in rows:
-            node, before = self._nodes[row], self._before[row]
-            if before >= 0:
-                graph.add(self._variables.odometry(self._nodes[before].id, node, self._motion(row)))
-            elif self._frames[node.session] == node.session:
+            node = self._nodes[row]
+            if self._before[row] < 0 and self._frames[node.session] == node.session:
                 graph.add(self._variables.prior(node.id, self._poses[row]))
+        if joined:
+            nodes, previous = (
+                [self._nodes[row] for row in which] for which in (joined, [self._before[r] for r in joined])
+            )
+            motions = se3.inverse(np.stack([x.T_odom_cam for x in previous])) @ np.stack([x.T_odom_cam for x in nodes])
+            covariances = white_covariances(nodes, motions, self._drift)
+            for before, node, motion, covariance in zip(previous, nodes, motions, covariances, strict=True):
+                graph.add(self._variables.odometry(before.id, node, motion, covariance))
         for key in loops:
             if key in self._loops:
                 graph.add(self._variables.loop(self._loops[key]))

@@ -2,7 +2,7 @@
 
 import heapq
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -45,8 +45,9 @@ class Ways:
     def __init__(self, chains: OdometryChains, axes: tuple[int, ...] = ALL_AXES) -> None:
         self._chains, self._axes = chains, np.array(axes)
         self._loops: dict[int, Constraint] = {}
-        self._at: dict[int, set[int]] = {}  # keyframe -> loops that end there
-        self._stops: dict[int, list[tuple[int, int]]] = {}  # session -> (step, keyframe), ascending
+        self._at: dict[int, list[tuple[int, int]]] = {}  # stop -> (other end, number) of the loops that end there
+        self._stops: dict[int, list[tuple[int, int]]] = {}  # session -> (step, stop), ascending
+        self._beside: dict[int, tuple[tuple[int, int], ...]] = {}  # stop -> (next stop, steps) along the odometry
 
     def __contains__(self, number: int) -> bool:
         return number in self._loops
@@ -54,21 +55,15 @@ class Ways:
     def add(self, number: int, loop: Constraint) -> None:
         """Open a loop for ways."""
         self._loops[number] = loop
-        for keyframe_id in (loop.query_id, loop.match_id):
+        for keyframe_id, other in ((loop.query_id, loop.match_id), (loop.match_id, loop.query_id)):
             if keyframe_id not in self._at:
-                self._at[keyframe_id] = set()
-                insort(self._stops.setdefault(self._session(keyframe_id), []), self._stop(keyframe_id))
-            self._at[keyframe_id].add(number)
-
-    def remove(self, number: int) -> None:
-        """Close a loop for ways."""
-        loop = self._loops.pop(number)
-        for keyframe_id in (loop.query_id, loop.match_id):
-            self._at[keyframe_id].discard(number)
-            if not self._at[keyframe_id]:
-                del self._at[keyframe_id]
-                stops = self._stops[self._session(keyframe_id)]
-                del stops[bisect_left(stops, self._stop(keyframe_id))]
+                self._at[keyframe_id] = []
+                stops = self._stops.setdefault(self._session(keyframe_id), [])
+                insort(stops, self._stop(keyframe_id))
+                place = bisect_left(stops, self._stop(keyframe_id))
+                for step, stop in stops[max(place - 1, 0) : place + 2]:
+                    self._beside[stop] = self._next_stops((step, stop), stops)
+            self._at[keyframe_id].append((other, number))
 
     def odometry(self, loop: Constraint) -> Way | None:
         """Return the way through odometry alone; None between sessions."""
@@ -114,38 +109,37 @@ class Ways:
         best: dict[int, float] = {start: 0.0}
         came: dict[int, Hop] = {}
         queue, done = [(0.0, start)], set()
+        session, goal = self._session(end), self._chains.step(end)
         while queue:
-            cost, keyframe_id = heapq.heappop(queue)
-            if keyframe_id in done:
+            cost, here = heapq.heappop(queue)
+            if here in done:
                 continue
-            done.add(keyframe_id)
-            if keyframe_id == end:
+            done.add(here)
+            if here == end:
                 return self._trace(came, start, end)
-            neighbours: list[tuple[int, float, int | None]] = list(self._along(keyframe_id, end))
-            for number in self._at.get(keyframe_id, ()):
-                if passable(number):
-                    loop = self._loops[number]
-                    other = loop.match_id if loop.query_id == keyframe_id else loop.query_id
-                    neighbours.append((other, LOOP_STEPS, number))
-            for other, length, passed in neighbours:
-                if other not in done and cost + length < best.get(other, np.inf):
-                    best[other] = cost + length
-                    came[other] = (keyframe_id, other, passed)
-                    heapq.heappush(queue, (cost + length, other))
+            reached: list[tuple[int, float, int | None]]
+            reached = [(other, cost + steps, None) for other, steps in self._along(here)]
+            reached += [(other, cost + LOOP_STEPS, n) for other, n in self._at.get(here, ()) if passable(n)]
+            if self._session(here) == session:
+                reached.append((end, cost + abs(goal - self._chains.step(here)), None))
+            for other, length, passed in reached:
+                if length < best.get(other, np.inf):
+                    best[other] = length
+                    came[other] = (here, other, passed)
+                    heapq.heappush(queue, (length, other))
         return None
 
-    def _along(self, keyframe_id: int, end: int) -> Iterator[tuple[int, float, int | None]]:
-        """Yield the next stops along the odometry, and the end of the way where it lies in this session."""
-        stops = self._stops.get(self._session(keyframe_id), [])
-        here = self._stop(keyframe_id)
+    def _along(self, keyframe_id: int) -> tuple[tuple[int, int], ...]:
+        """Return the next stops along the odometry before and after a keyframe, and how many steps away they are."""
+        if keyframe_id in self._beside:
+            return self._beside[keyframe_id]
+        return self._next_stops(self._stop(keyframe_id), self._stops.get(self._session(keyframe_id), []))
+
+    def _next_stops(self, here: tuple[int, int], stops: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
         place = bisect_left(stops, here)
         after = place + 1 if place < len(stops) and stops[place] == here else place
-        near = [stops[k] for k in (place - 1, after) if 0 <= k < len(stops)]
-        if self._session(end) == self._session(keyframe_id):
-            near.append(self._stop(end))
-        for step, other in near:
-            if other != keyframe_id:
-                yield other, float(abs(step - here[0])), None
+        near = (stops[k] for k in (place - 1, after) if 0 <= k < len(stops))
+        return tuple((stop, abs(step - here[0])) for step, stop in near)
 
     def _trace(self, came: dict[int, Hop], start: int, end: int) -> list[Hop]:
         """Return the hops from start to end, neighbouring ones along the odometry as one."""

@@ -1,12 +1,13 @@
 """Which loops are believed, and when they no longer are: two laps of a circle, loops from the second to the first."""
 
 import numpy as np
+import pytest
 
 from seamark.backend.chain import OdometryChains
 from seamark.backend.config import BackendConfig
 from seamark.backend.consistency import odometry_chi2
 from seamark.backend.graph_types import Constraint, Node
-from seamark.backend.judge import PoseJudge
+from seamark.backend.judge import MARGIN_SHARE, PoseJudge
 from seamark.backend.ledger import Finding, LoopHistory, LoopLedger
 from seamark.backend.types import Reason
 
@@ -98,3 +99,25 @@ def test_all_at_once_gives_what_one_by_one_gives():
             ledger.add_all(batch)
         verdicts.append([ledger.history(loop.key).verdict for loop in loops])
     assert verdicts[0] == verdicts[1] and Reason.INCONSISTENT in verdicts[0] and Reason.ACCEPTED in verdicts[0]
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.5])
+def test_a_short_group_on_the_margin_of_odometry_waits_where_other_groups_were_refuted(offset):
+    """Test: a group alone, then two that refute each other elsewhere. Expected: it stays only if odometry is close."""
+    ledger, truth, chains = ledger_after()
+    rng = np.random.default_rng(4)
+    short = [finding(truth, 100 + k, k, rng, offset) for k in range(5)]
+    for loop in short:
+        ledger.add(loop)
+    strain = odometry_chi2([loop.constraint for loop in short], chains) / CONFIG.consistency.gate_chi2
+    assert all(ledger.history(loop.key).verdict == Reason.ACCEPTED for loop in short)
+    for q in range(160, 165):
+        ledger.add(finding(truth, q, q - LAP, rng, offset=1.2))
+    for q in range(160, 165):
+        ledger.add(finding(truth, q, q - LAP + 1, rng, offset=-1.2))
+    stays = strain[2] <= MARGIN_SHARE
+    assert stays == (offset == 0.0)
+    for loop in short:
+        history = ledger.history(loop.key)
+        assert history.verdict == (Reason.ACCEPTED if stays else Reason.UNCONFIRMED)
+        assert history.withdrawals == (0 if stays else 1)
