@@ -71,6 +71,11 @@ class Slam:
         """Return whether the keyframe has been taken in: messages may be delivered twice."""
         return keyframe_id in self._map.keyframes
 
+    @property
+    def feature_bytes(self) -> int:
+        """Return how many bytes the features in memory take."""
+        return self._memory.n_bytes
+
     def step(self, keyframe: Keyframe, candidates: Candidates) -> StepResult:
         """Take in a keyframe and the places that it may show; raises BackendInputError when it is malformed."""
         timings_ms = {}

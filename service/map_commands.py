@@ -66,6 +66,22 @@ def repair_command(
         print_table(map_report.repair_table(out, report))
 
 
+@map_app.command("backup")
+def backup_command(
+    map_file: MapArgument,
+    out: Annotated[Path, typer.Option("--out", help="The new map file to write.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Copy a map as it is at this moment. A service may be writing it meanwhile, and is not held up."""
+    from seamark.backend.map_backup import back_up_map
+
+    size = back_up_map(map_file, out)
+    if as_json:
+        print_json({"out": str(out), "bytes": size})
+    else:
+        typer.echo(f"{out}: {size} bytes")
+
+
 @map_app.command("export")
 def export_command(
     map_file: MapArgument,

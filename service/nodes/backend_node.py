@@ -27,7 +27,7 @@ from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.requests import Done, Forget
+from seamark.service.requests import Done, Forget, Status
 from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
@@ -72,8 +72,8 @@ class BackendNode:
             self._restore(store)
         place_service = PlaceService(places, camera, self._rank, slam.locate)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
-        bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
-        bus.handle(topics.PROGRESS[bus.node], lambda _: self._meter.status())
+        bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
+        bus.handle(topics.PROGRESS[bus.node], lambda _: self._status())
         bus.handle(topics.MAP_SNAPSHOT, lambda _: self._slam.snapshot(), workers=1)
         bus.handle(topics.PLACE, place_service.answer, workers=PLACE_WORKERS)
         bus.handle(topics.CANDIDATES, self._on_candidates)
@@ -139,6 +139,10 @@ class BackendNode:
             self._settled = False
             self._meter.count("keyframes")
             self._map_ready()
+
+    def _status(self) -> Status:
+        self._meter.keep("feature_bytes", self._slam.feature_bytes)
+        return self._meter.status()
 
     def _refuse(self, keyframe_id: int) -> None:
         """Let nobody wait for a keyframe that the disk has refused."""

@@ -39,6 +39,7 @@ class MapPruner:
 
     def _prune(self, newest_id: int) -> None:
         store = self._keeper.store
+        self._meter.keep("map_bytes", store.bytes_used())
         if budget(store, self._limits) is None:
             return
         with self._meter.timed("prune"):
@@ -60,5 +61,6 @@ class MapPruner:
             if not self._keeper.contract(change):
                 return
             self._slam.adopt(change)
+        self._meter.keep("map_bytes", store.bytes_used())
         self._forgotten(sorted(change.graph.gone))
         self._meter.count("views_forgotten", len(pruning.forget))

@@ -1,0 +1,38 @@
+"""A copy of a map, also of one that a service is writing."""
+
+import os
+from pathlib import Path
+
+from seamark.backend.errors import MapError
+from seamark.backend.map_store import MapStore
+
+
+def back_up_map(path: Path, out: Path) -> int:
+    """Write the map as it is at this moment to the new file ``out``; return its size in bytes.
+
+    It is on disk when this returns. The writer of the map is not held up. Raises MapError, and leaves nothing, when
+    ``out`` exists or cannot be written.
+    """
+    if out.exists():
+        raise MapError(f"{out} exists: a backup writes a new file")
+    partial = out.with_name(out.name + ".partial")
+    try:
+        with MapStore(path, read_only=True) as store:
+            store.copy(partial)
+        _sync(partial)
+        partial.rename(out)
+        _sync(out.absolute().parent)
+        return out.stat().st_size
+    except OSError as error:
+        raise MapError(f"{out} cannot be written: {error.strerror}") from error
+    finally:
+        for leftover in (partial, *(partial.with_name(partial.name + end) for end in ("-wal", "-shm", "-journal"))):
+            leftover.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
