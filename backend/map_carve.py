@@ -34,7 +34,10 @@ class _NoRowError(Exception):
 
 
 def carve(path: Path) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    """Yield (table, values without checksum) of every whole row in a file, stale copies included, in page order."""
+    """Yield (table, values without checksum) of every whole row in a file, stale copies included.
+
+    Pages that the file calls free come last: what is in them was deleted, or has been written elsewhere since.
+    """
     if path.stat().st_size == 0:
         return
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -45,7 +48,9 @@ def _rows(content: mmap.mmap, size: int) -> Iterator[tuple[str, tuple[Any, ...]]
     by_columns: dict[int, list[str]] = {}
     for table, columns in COLUMNS.items():
         by_columns.setdefault(len(columns) + 1, []).append(table)
-    for start in range(0, len(content), size):
+    free = _free_pages(content, size)
+    starts = [*range(0, len(content), size)]
+    for start in sorted(starts, key=lambda start: start // size + 1 in free):
         page = bytes(content[start : start + size])
         for number, payload in _cells(content, page, start, size):
             try:
@@ -68,6 +73,22 @@ def _row_of(table: str, number: int, values: tuple[Any, ...]) -> tuple[Any, ...]
         float(value) if name in reals and isinstance(value, int) else value
         for name, value in zip(COLUMNS[table], values, strict=True)
     )
+
+
+def _free_pages(content: mmap.mmap, size: int) -> set[int]:
+    """Return the numbers of the pages in the list of free ones, as far as it can be followed."""
+    found: set[int] = set()
+    if bytes(content[:16]) != HEADER:
+        return found
+    (trunk,) = struct.unpack(">I", content[32:36])
+    while trunk and trunk not in found and trunk * size <= len(content):
+        found.add(trunk)
+        start = (trunk - 1) * size
+        following, count = struct.unpack(">II", content[start : start + 8])
+        if count <= size // 4 - 2:
+            found |= set(struct.unpack(f">{count}I", content[start + 8 : start + 8 + 4 * count]))
+        trunk = following
+    return found
 
 
 def _page_size(content: mmap.mmap) -> int:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import tempfile
 from array import array
 from collections.abc import Callable, Iterable, Iterator
@@ -49,7 +50,8 @@ def export_map(path: Path, out: Path, kind: Format, component: int | None = None
                 f"{path} has no keyframes with poses" + (f" in {component}" if component is not None else "")
             )
         if kind is Format.COLMAP:
-            return _colmap(store, poses, out)
+            with _made_whole(out) as folder:
+                return _colmap(store, poses, folder)
         writer: dict[Format, Callable[[MapStore, Poses, TextIO], dict[str, int]]] = {
             Format.TUM: _tum,
             Format.KITTI: _kitti,
@@ -138,17 +140,16 @@ def _information(covariance: NDArray[np.float64] | None) -> str:
     return " ".join(f"{value:.9g}" for value in matrix[np.ix_(order, order)][np.triu_indices(6)])
 
 
-def _colmap(store: MapStore, poses: Poses, out: Path) -> dict[str, int]:
+def _colmap(store: MapStore, poses: Poses, folder: Path) -> dict[str, int]:
     """Write cameras.txt, images.txt, points3D.txt and images/; of all observations only their numbers are in memory."""
-    partial = out.with_name(out.name + ".partial")
-    (partial / "images").mkdir(parents=True)
+    (folder / "images").mkdir(parents=True)
     nodes = {node.id: node for node in store.load_nodes() if node.id in poses and node.camera is not None}
     seen = [number for number in store.keyframe_ids(recognisable=True) if number in nodes]
     cameras = {camera: number for number, camera in enumerate(dict.fromkeys(nodes[n].camera for n in seen), 1)}
-    (partial / "cameras.txt").write_text("".join(f"{n} {_colmap_camera(c)}\n" for c, n in cameras.items()))  # type: ignore[arg-type]
+    (folder / "cameras.txt").write_text("".join(f"{n} {_colmap_camera(c)}\n" for c, n in cameras.items()))  # type: ignore[arg-type]
     count = 0
     pairs_of: dict[int, array[int]] = {}  # keyframe -> index of a feature, its point, the next index, ...
-    with (partial / "points3D.txt").open("w") as file:
+    with (folder / "points3D.txt").open("w") as file:
         for point in points_of(store, {number: poses[number] for number in seen}):
             if len(point.views) < 2:
                 continue
@@ -158,11 +159,11 @@ def _colmap(store: MapStore, poses: Poses, out: Path) -> dict[str, int]:
             file.write(f"{point.id} {x:.9g} {y:.9g} {z:.9g} 128 128 128 {point.error_px:.4g} {track}\n")
             for view, index in point.views:
                 pairs_of.setdefault(view, array("i")).extend((index, point.id))
-    with (partial / "images.txt").open("w") as file:
+    with (folder / "images.txt").open("w") as file:
         for number in seen:
             keyframe = store.keyframe(number, (FEATURES, IMAGES))
             name = f"{number:08d}.jpg"
-            (partial / "images" / name).write_bytes(keyframe.jpeg)
+            (folder / "images" / name).write_bytes(keyframe.jpeg)
             T = se3.inverse(poses[number][0])
             x, y, z, w = se3.to_quaternion(T[:3, :3])
             numbers = " ".join(f"{value:.9g}" for value in (w, x, y, z, *T[:3, 3]))
@@ -173,7 +174,6 @@ def _colmap(store: MapStore, poses: Poses, out: Path) -> dict[str, int]:
             point_of = dict(zip(pairs[::2], pairs[1::2], strict=True))
             named = (f"{u:.3f} {v:.3f} {point_of.get(i, -1)}" for i, (u, v) in enumerate(points.tolist()))
             file.write(" ".join(named) + "\n")
-    partial.rename(out)
     return {"cameras": len(cameras), "images": len(seen), "points": count}
 
 
@@ -190,7 +190,7 @@ def _colmap_camera(camera: Camera) -> str:
 def _ply(store: MapStore, poses: Poses, out: Path) -> dict[str, int]:
     """Write a binary point cloud; the header comes last, because only then the number of points is known."""
     count = 0
-    with tempfile.TemporaryFile(dir=out.absolute().parent) as body:
+    with _made_whole(out) as partial, tempfile.TemporaryFile(dir=out.absolute().parent) as body:
         for batch in _batches(point.position for point in points_of(store, poses)):
             rows = np.zeros(len(batch), _PLY_ROW)
             for axis, name in enumerate("xyz"):
@@ -200,12 +200,10 @@ def _ply(store: MapStore, poses: Poses, out: Path) -> dict[str, int]:
         body.seek(0)
         header = f"ply\nformat binary_little_endian 1.0\ncomment {json.dumps('Seamark, frame of the map')}\n"
         header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in "xyz") + "end_header\n"
-        partial = out.with_name(out.name + ".partial")
         with partial.open("wb") as file:
             file.write(header.encode())
             while chunk := body.read(1 << 20):
                 file.write(chunk)
-        partial.rename(out)
     return {"points": count}
 
 
@@ -221,16 +219,30 @@ def _batches(positions: Iterable[NDArray[np.float64]]) -> Iterator[NDArray[np.fl
 
 
 @contextmanager
-def _new_file(out: Path) -> Iterator[TextIO]:
-    """Write under another name until all is written."""
+def _made_whole(out: Path) -> Iterator[Path]:
+    """Give the name under which a file or folder is made, which gets its own name when all is written."""
     partial = out.with_name(out.name + ".partial")
+    _remove(partial)  # of an export that was killed
     try:
-        with partial.open("w", encoding="utf-8") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield partial
         partial.rename(out)
     except OSError as error:
-        raise MapError(f"{out} cannot be written: {error}") from error
+        raise MapError(f"{out} cannot be written: {error.strerror}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        _remove(partial)
+
+
+@contextmanager
+def _new_file(out: Path) -> Iterator[TextIO]:
+    """Write under another name until all is written."""
+    with _made_whole(out) as partial, partial.open("w", encoding="utf-8") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import shutil
 import sqlite3
 import threading
 import time
@@ -20,6 +21,7 @@ logger = logging.getLogger(__name__)
 
 READERS_PATIENCE_S: Final = 1.0  # how long a writer waits for those who read the file as it is
 BUSY_TIMEOUT_S: Final = 5.0  # how long SQLite waits for another connection of this process
+FULL_BYTES: Final = 1 << 16  # of free space, of which SQLite's shared index alone takes a half
 _WAL_LIMIT_BYTES: Final = 64 << 20
 _UNWRITABLE: Final = ("SQLITE_FULL", "SQLITE_READONLY", "SQLITE_IOERR", "SQLITE_CANTOPEN")
 _UNWRITABLE_ERRNO: Final = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
@@ -81,14 +83,16 @@ class MapFile:
             with self._lock:
                 yield
         except sqlite3.Error as error:
-            name, kind = getattr(error, "sqlite_errorname", ""), MapError
+            name, kind, why = getattr(error, "sqlite_errorname", ""), MapError, str(error)
             if name == "SQLITE_NOTADB":
                 raise MapVersionError(f"{self.path} is no map of Seamark") from error
             if name.startswith(_UNWRITABLE):
                 kind = MapUnwritableError
+                if _is_full(self.path.absolute().parent):
+                    why = "no space left on the disk"
             elif name.startswith(_CORRUPT):
                 kind = MapCorruptError
-            raise kind(f"the map {self.path} cannot be {verb}: {error}") from error
+            raise kind(f"the map {self.path} cannot be {verb}: {why}") from error
         except OSError as error:
             kind = MapUnwritableError if error.errno in _UNWRITABLE_ERRNO else MapError
             raise kind(f"the map {self.path} cannot be {verb}: {error}") from error
@@ -167,6 +171,9 @@ class MapFile:
             return
         database.execute("PRAGMA journal_mode = WAL")
         database.execute("PRAGMA synchronous = FULL")
+        # Some builds of SQLite overwrite what is deleted with zeros: forgetting a keyframe would cost as much writing
+        # as learning it, and could not be done on a full disk.
+        database.execute("PRAGMA secure_delete = FAST")
         database.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
         database.execute("PRAGMA foreign_keys = ON")
         if new or version < SCHEMA_VERSION:
@@ -181,6 +188,14 @@ class MapFile:
                 database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         if new:
             _sync_folder(self.path.absolute().parent)
+
+
+def _is_full(folder: Path) -> bool:
+    """Return whether there is no room for a page: SQLite calls that an I/O error here and there."""
+    try:
+        return shutil.disk_usage(folder).free < FULL_BYTES
+    except OSError:
+        return False
 
 
 def _has_content(path: Path) -> bool:

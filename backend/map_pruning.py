@@ -1,8 +1,10 @@
 """Pruning a map that no service has open."""
 
+import logging
 from pathlib import Path
 
 from seamark.backend.config import BackendConfig
+from seamark.backend.errors import MapUnwritableError
 from seamark.backend.map_open import loader, restore
 from seamark.backend.map_prune import Pruning, choose, views_of
 from seamark.backend.map_store import MapStore
@@ -10,11 +12,14 @@ from seamark.backend.slam import Slam
 from seamark.backend.solver import SolverProcess
 from seamark.frontend.types import Mode
 
+logger = logging.getLogger(__name__)
+
 
 def prune_map(path: Path, keyframes: int, config: BackendConfig) -> Pruning:
     """Forget redundant views until ``keyframes`` are left, as far as places allow; raises MapError.
 
-    The last keyframe stays: the next one hangs on it. Nothing is solved.
+    The last keyframe stays: the next one hangs on it. Nothing is solved. A disk without room for a second copy leaves
+    the file as large as it was.
     """
     with MapStore(path) as store:
         mode = Mode(store.meta().get("mode", Mode.RGBD))
@@ -30,5 +35,8 @@ def prune_map(path: Path, keyframes: int, config: BackendConfig) -> Pruning:
         blind = known - {view.id for view in views}
         change = slam.without({*pruning.forget, *blind} - spared)
         store.contract(change)
-        store.compact()
+        try:
+            store.compact()
+        except MapUnwritableError as error:
+            logger.warning("%s; the file stays as large as it was, and what is free in it is used again", error)
     return pruning

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from collections.abc import Collection
 from concurrent.futures import Future
 
@@ -31,6 +32,7 @@ from seamark.service.requests import Done, Forget, Status
 from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
+STOP_PATIENCE_S = 0.5
 
 
 class BackendNode:
@@ -80,9 +82,15 @@ class BackendNode:
         bus.handle(topics.KEYFRAME, self._on_keyframe)
 
     def stop(self) -> None:
-        """Map what is waiting, as far as that is known, and write the poses as they are."""
+        """Map what is waiting, as far as that goes quickly, and write the poses as they are.
+
+        What is still waiting then is on disk, and mapped after the next start.
+        """
+        deadline = time.monotonic() + STOP_PATIENCE_S
         with self._lock:
             for keyframe_id in list(self._waiting):
+                if time.monotonic() > deadline:
+                    break
                 self._map(keyframe_id)
             if not self._settled and self._keeper is not None:
                 self._keeper.save(snapshot=self._slam.snapshot())
@@ -188,7 +196,8 @@ class BackendNode:
                 result = self._slam.step(keyframe, candidates)
             self._tell(result, keyframe_id, mapped)
         except Exception as error:
-            mapped.set_exception(error)
+            if not mapped.done():  # it is on disk where only telling of it has failed, as when the bus is closed
+                mapped.set_exception(error)
             raise
         if self._pruner is not None:
             self._pruner.mapped(keyframe_id)

@@ -24,7 +24,7 @@ from seamark.service.sources.decode import UnreadableImageError, decode, to_imag
 
 logger = logging.getLogger(__name__)
 
-STOP_PATIENCE_S = 1.5
+STOP_PATIENCE_S = 1.0
 STALL_S = 2.0  # without an acknowledgement: then the map takes nothing
 
 

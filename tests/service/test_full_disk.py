@@ -1,7 +1,9 @@
 """The real service on a disk that is full, and one that can only be read: it answers, and learns when it can again."""
 
 import os
+import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -20,6 +22,7 @@ from seamark.service.config import load_config
 from seamark.service.launcher import Launcher
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty, PlaceQuery, PlaceReply
+from seamark.service.run import RunOptions, run
 from seamark.vocab.training import train
 
 pytestmark = pytest.mark.zenoh
@@ -150,3 +153,46 @@ def test_a_map_on_a_read_only_disk_is_answered_from(settings: NodeSettings, disk
         remount("rw")
     with MapStore(path) as store:
         assert store.keyframe_ids() == [*before, *after]
+
+
+def test_commands_on_a_full_disk_say_so_and_leave_nothing(disk: Path, map_of_a_run: Path) -> None:
+    """Test: no room for anything, then for little. Expected: a sentence and exit code 1; pruning goes through."""
+    path, filler = disk / "map.seamark", disk / "filler"
+    shutil.copy(map_of_a_run, path)
+    with filler.open("wb", buffering=0) as file, pytest.raises(OSError):
+        while True:
+            file.write(bytes(4096))
+    content = path.read_bytes()
+    commands = [("prune", path, "--keyframes", 5), ("optimise", path, "--full")]
+    commands += [("backup", path, "--out", disk / "b.seamark"), ("repair", path, "--out", disk / "r.seamark")]
+    commands += [("export", path, "--out", disk / "x", "--format", name) for name in ("tum", "g2o", "colmap", "ply")]
+    for words in commands:
+        done = seamark(*words)
+        assert done.returncode == 1 and done.stdout == ""
+        last = done.stderr.splitlines()[-1]
+        assert last.startswith("error: ") and ("No space left" in last or "no space left" in last), done.stderr
+        assert path.read_bytes() == content
+        assert {one.name for one in disk.iterdir()} <= {"map.seamark", "map.seamark-wal", "map.seamark-shm", "filler"}
+    with filler.open("r+b") as file:
+        file.truncate(filler.stat().st_size - (1 << 20))
+    wide = ("place_m=100", "place_deg=179", "lighting=1")
+    everything = [word for name in wide for word in ("-o", f"backend.map.{name}")]
+    pruned = seamark("prune", path, "--keyframes", 5, *everything)
+    assert pruned.returncode == 0 and "5 kept" in pruned.stdout and "is used again" in pruned.stderr
+    assert check_map(path).problems == ()
+    with MapStore(path, read_only=True) as store:
+        assert len(store.keyframe_ids()) == 5
+    assert path.stat().st_size == len(content)
+
+
+def seamark(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [str(Path(sys.executable).parent / "seamark"), "map", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+
+@pytest.fixture(scope="module")
+def map_of_a_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "run"
+    config = load_config(overrides=["frontend.keyframe_parallax_px=8", "service.record=false"])
+    run(toy_sequence("loop", 60, SEED, Mode.RGBD), RunOptions(folder, ("toy",), in_process=True), config)
+    return folder / "map.seamark"
