@@ -16,7 +16,9 @@ def probability(query: Keyframe, match: Keyframe, score: float) -> float:
     It is that of ``seamark places match`` (vocab.confidence), without doubt between several places.
     """
     evidence = spatial.compare(_local(query), _local(match))
-    return confidence.probability_single(score + spatial.SUPPORT_WEIGHT * evidence.support, evidence.inliers)
+    return confidence.AS_THEY_ARE.probability_single(
+        score + spatial.SUPPORT_WEIGHT * evidence.support, evidence.inliers
+    )
 
 
 def _local(keyframe: Keyframe) -> spatial.LocalFeatures:

@@ -150,6 +150,12 @@ def main() -> None:
     pairs = [(sets[a], sets[b], True) for a, b in PAIRS]
     pairs += [(sets[a], Set(f"{b}, worse", sets[b].worse, sets[b].poses, []), True) for a, b in PAIRS]
     pairs.append((*generated(options.images), False))
+    for alone in (True, False):
+        calibrate(pairs, alone=alone)
+
+
+def calibrate(pairs: Sequence[tuple[Set, Set, bool]], *, alone: bool) -> None:
+    """Print the weights for scores of the place index (alone), or without what the images of each set share."""
     vocabulary, config = Vocabulary.default(), VocabConfig()
     singles, ways = [], []
     for database, queries, ordered in pairs:
@@ -157,7 +163,7 @@ def main() -> None:
         for in_order, found in ((False, singles), (True, ways)):
             if in_order and not ordered:
                 continue
-            arguments = {"top": 1, "in_order": in_order, "workers": 1}
+            arguments = {"top": 1, "in_order": in_order, "workers": 1, "alone": alone}
             answers = search(database.images, queries.images, vocabulary, config, **arguments)  # type: ignore[arg-type]
             part = list(correctness(database, queries, answers, one_world=one_world))
             found += part
@@ -168,12 +174,13 @@ def main() -> None:
                 f"median score right/wrong {'/'.join(scores)}, most inliers of a wrong one {most}",
                 flush=True,
             )
+    name = "AS_THEY_ARE" if alone else "TRAVERSALS"
     right = np.array([r for _, r in singles])
     x = np.array([(a.evidence, np.log1p(a.matches[0].inliers)) for a, _ in singles])
-    describe_fit("SINGLE", fit(x, right), x, right)
+    describe_fit(f"{name}, single", fit(x, right), x, right)
     right = np.array([r for _, r in ways])
     x = np.array([(a.evidence,) for a, _ in ways])
-    describe_fit("ALONG_WAY", fit(x, right), x, right)
+    describe_fit(f"{name}, along a way", fit(x, right), x, right)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,10 @@ NAMED_IN_WARNING = 3
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """What was asked for; ``vocabulary`` None means the one that ships, ``in_order`` that order is evidence."""
+    """What was asked for; ``vocabulary`` None means the one that ships, ``in_order`` that order is evidence.
+
+    With ``alone`` the answer to a query depends on no other query.
+    """
 
     database: Path
     queries: Path
@@ -32,6 +35,7 @@ class MatchOptions:
     top: int = 20
     in_order: bool = False
     vocabulary: Path | None = None
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,14 @@ def match_folders(
         warn_of_unreadable(str(folder), described[-1], warn)
     database, queries = described
     answers = search(
-        database, queries, vocabulary, config.vocab, top=options.top, in_order=options.in_order, workers=workers
+        database,
+        queries,
+        vocabulary,
+        config.vocab,
+        top=options.top,
+        in_order=options.in_order,
+        workers=workers,
+        alone=options.alone,
     )
     rows = matches_table(database, queries, answers)
     write_table(options.out, rows)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from seamark.service.places_images import DescribedImage
 from seamark.service.places_motion import AGREES, CONTRADICTS, Motion
-from seamark.vocab import confidence, sequence
-from seamark.vocab.confidence import Verdict
+from seamark.vocab import confidence, histogram, sequence, traversals, view
+from seamark.vocab.confidence import Calibration, Verdict
 from seamark.vocab.config import VocabConfig
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.spatial import SUPPORT_WEIGHT, SpatialEvidence, compare
@@ -59,7 +59,7 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """All places for all queries: ``score``, ``votes`` and ``jeffrey`` (queries, places) float32.
+    """All places for all queries: ``score``, ``votes``, ``jeffrey`` and ``view`` (queries, places) float32.
 
     The score is NaN where a place may not be asked for.
     """
@@ -67,6 +67,7 @@ class _Table:
     score: NDArray[np.float32]
     votes: NDArray[np.float32]
     jeffrey: NDArray[np.float32]
+    view: NDArray[np.float32]
 
 
 def search(
@@ -78,10 +79,13 @@ def search(
     top: int,
     in_order: bool,
     workers: int,
+    alone: bool = False,
 ) -> list[Answer]:
     """Answer every query with ``top`` places, fewer only where the database is smaller.
 
-    ``in_order`` says that both were taken along a way, and lets neighbours count; otherwise each query is alone.
+    ``in_order`` says that both were taken along a way, and lets neighbours count. Otherwise no order is used, but what
+    all images of either set have in common is left out of the comparison; with ``alone`` not even that is done, and the
+    answer to a query does not depend on the others.
     """
     index = PlaceIndex(vocabulary, config)
     for number, image in enumerate(database):
@@ -89,7 +93,10 @@ def search(
     table = _empty_table(len(queries), len(database))
     for row, query in enumerate(queries):
         _fill(table, row, index.query(query.observation(QUERY_ID, QUERY_SESSION), len(database)).ranked)
-    return _answers(table, database, queries, top, in_order, workers)
+    if not alone and len(queries) and len(database):
+        table = replace(table, score=_score_traversals(table, database, queries, config))
+    calibration = confidence.AS_THEY_ARE if alone else confidence.TRAVERSALS
+    return _answers(table, database, queries, top, in_order, workers, calibration)
 
 
 def search_own(
@@ -117,15 +124,42 @@ def search_own(
         observation = image.observation(row, DATABASE_SESSION, stamp_ns)
         _fill(table, row, index.query(observation, max(1, len(index))).ranked)
         index.add(observation)
-    answers = _answers(table, images, images, top, in_order, workers, motion)
+    answers = _answers(table, images, images, top, in_order, workers, confidence.AS_THEY_ARE, motion)
     if in_order and motion is not None:
         answers = _accept_streaks(answers, motion)
     return answers, np.isfinite(table.score)
 
 
+def _score_traversals(
+    table: _Table, database: Sequence[DescribedImage], queries: Sequence[DescribedImage], config: VocabConfig
+) -> NDArray[np.float32]:
+    """Return the scores (queries, places) of two traversals without what all images of each have in common."""
+    places, asking = ([image for image in images if image.problem is None] for images in (database, queries))
+    beyond = np.zeros_like(table.score)
+    readable = np.ix_(*(np.flatnonzero([image.problem is None for image in images]) for images in (queries, database)))
+    beyond[readable] = traversals.view_likeness(_cells(asking), _cells(places))
+    likeness = traversals.AS_THEY_ARE * table.view + (1.0 - traversals.AS_THEY_ARE) * beyond
+    trust = traversals.histogram_trust(*_histograms(asking, config), *_histograms(places, config))
+    said = np.array([min(1.0, len(image.descriptors) / config.trusted_features) for image in queries], np.float32)
+    return traversals.fuse(config, table.votes * said[:, None], table.jeffrey, likeness, trust)
+
+
+def _cells(images: Sequence[DescribedImage]) -> NDArray[np.int8]:
+    return np.stack([view.describe(image.thumbnail).cells for image in images]) if images else view.NO_CELLS
+
+
+def _histograms(images: Sequence[DescribedImage], config: VocabConfig) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    bins, sigma_bins = config.histogram_bins, config.histogram_sigma_bins
+    found = [histogram.describe(image.thumbnail, bins, sigma_bins) for image in images]
+    if not found:
+        channels = len(histogram.CHANNELS)
+        return np.zeros((0, channels, bins), np.float32), np.zeros((0, channels), np.bool_)
+    return np.stack([one.values for one in found]), np.stack([one.present for one in found])
+
+
 def _empty_table(queries: int, places: int) -> _Table:
     score = np.full((queries, places), np.nan, np.float32)
-    return _Table(score, np.zeros_like(score), np.zeros_like(score))
+    return _Table(score, np.zeros_like(score), np.zeros_like(score), np.zeros_like(score))
 
 
 def _fill(table: _Table, row: int, ranked: Sequence[Candidate]) -> None:
@@ -133,6 +167,7 @@ def _fill(table: _Table, row: int, ranked: Sequence[Candidate]) -> None:
     table.score[row, places] = [candidate.score for candidate in ranked]
     table.votes[row, places] = [candidate.votes for candidate in ranked]
     table.jeffrey[row, places] = [candidate.jeffrey for candidate in ranked]
+    table.view[row, places] = [candidate.view for candidate in ranked]
 
 
 def _answers(
@@ -142,6 +177,7 @@ def _answers(
     top: int,
     in_order: bool,
     workers: int,
+    calibration: Calibration,
     motion: Motion | None = None,
 ) -> list[Answer]:
     evidence = _evidence_along_ways(table.score) if in_order else None
@@ -165,7 +201,7 @@ def _answers(
         if not in_order and ranked and verified[ranked[0]].inliers < confidence.MIN_INLIERS:
             off += confidence.FEW_INLIERS_DOUBT
         matches = [_match(table, row, place, score[place] - off, verified.get(place)) for place in ranked[:top]]
-        decided = _decide(queries[row], matches, score[ranked[0]] if ranked else 0.0, in_order)
+        decided = _decide(queries[row], matches, score[ranked[0]] if ranked else 0.0, in_order, calibration)
         return decided if motion is None else _heed(decided, row, motion)
 
     with ThreadPoolExecutor(workers, thread_name_prefix="compare") as pool:
@@ -222,15 +258,17 @@ def _match(table: _Table, row: int, place: int, score: float, found: SpatialEvid
     return Match(place, score, float(table.votes[row, place]), float(table.jeffrey[row, place]), inliers)
 
 
-def _decide(query: DescribedImage, matches: list[Match], evidence: float, in_order: bool) -> Answer:
+def _decide(
+    query: DescribedImage, matches: list[Match], evidence: float, in_order: bool, calibration: Calibration
+) -> Answer:
     """Accept the first place or none."""
     if not matches:
         return Answer((), evidence, 0.0, Verdict.EMPTY)
     best = matches[0]
     if in_order:
-        probability = confidence.probability_along_way(evidence)
+        probability = calibration.probability_along_way(evidence)
     else:
-        probability = confidence.probability_single(evidence, best.inliers)
+        probability = calibration.probability_single(evidence, best.inliers)
     verdict = Verdict.ACCEPTED
     if query.problem is not None:
         verdict, probability = Verdict.UNREADABLE, 0.0

@@ -1,6 +1,7 @@
 """How sure an answer is: probabilities from the distributions of scores, and what none of them supports."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -31,25 +32,36 @@ class Verdict(StrEnum):
     DOUBT = "doubt"  # several places are about as good and cannot all be right
 
 
-# Weights of 1, the verified score and ln(1 + inliers); found by benchmarks/calibrate_places.py, see docs/benchmarks.md.
-SINGLE: Final = (-9.188, 14.04, 2.333)
-# Weights of 1 and the mean evidence along the best way, in standard deviations per image.
-ALONG_WAY: Final = (-10.97, 5.461)
+@dataclass(frozen=True)
+class Calibration:
+    """Weights of logistic regressions, found by benchmarks/calibrate_places.py (see docs/benchmarks.md).
 
-
-def probability_single(score: float, inliers: int) -> float:
-    """Return how probable it is that the best place of one image is the right one (logistic regression).
-
-    ``score`` is that of the place index plus the support of its spatial evidence.
+    ``single``: of 1, the verified score and ln(1 + inliers). ``along_way``: of 1 and the mean evidence along the best
+    way, in standard deviations per image.
     """
-    constant, by_score, by_inliers = SINGLE
-    return _logistic(constant + by_score * score + by_inliers * float(np.log1p(inliers)))
+
+    single: tuple[float, float, float]
+    along_way: tuple[float, float]
+
+    def probability_single(self, score: float, inliers: int) -> float:
+        """Return how probable it is that the best place of one image is the right one (logistic regression).
+
+        ``score`` is that of the place index plus the support of its spatial evidence.
+        """
+        constant, by_score, by_inliers = self.single
+        return _logistic(constant + by_score * score + by_inliers * float(np.log1p(inliers)))
+
+    def probability_along_way(self, evidence: float) -> float:
+        """Return how probable it is that the best place of one image of a sequence is the right one."""
+        constant, slope = self.along_way
+        return _logistic(constant + slope * evidence)
 
 
-def probability_along_way(evidence: float) -> float:
-    """Return how probable it is that the best place of one image of a sequence is the right one."""
-    constant, slope = ALONG_WAY
-    return _logistic(constant + slope * evidence)
+AS_THEY_ARE: Final = Calibration((-9.188, 14.04, 2.333), (-10.97, 5.461))
+"""Of scores of the place index."""
+
+TRAVERSALS: Final = Calibration((-7.742, 14.25, 2.067), (-8.878, 4.984))
+"""Of scores without what all images of either traversal have in common."""
 
 
 def doubt(scores: Sequence[float]) -> float:

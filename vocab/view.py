@@ -12,6 +12,7 @@ from seamark.vocab.errors import ObservationError
 ROWS: Final = 9
 COLUMNS: Final = 16
 ORIENTATIONS: Final = 8
+NO_CELLS: Final = np.zeros((0, ROWS, COLUMNS, ORIENTATIONS), np.int8)
 SHIFTS: Final = tuple(range(-4, 5))
 """Sideways shifts, in columns, under which two views are compared: a quarter of the picture to either side."""
 

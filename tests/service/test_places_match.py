@@ -103,6 +103,34 @@ def test_views_from_elsewhere_find_their_place(folders: tuple[Path, Path], tmp_p
         assert int(best[f"q{number}"]["inliers"]) < 8
 
 
+def test_the_order_of_files_never_matters_and_alone_no_other_query_does(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Test: the same queries under names in reverse order, and a single one. Expected: the same rows for each."""
+    names = sorted(path.name for path in folders[1].iterdir())
+    reverse, single = tmp_path / "reverse", tmp_path / "single"
+    for folder in (reverse, single):
+        folder.mkdir()
+    renamed = {name: f"{number}{Path(name).suffix}" for number, name in enumerate(reversed(names))}
+    for name, other in renamed.items():
+        (reverse / other).write_bytes((folders[1] / name).read_bytes())
+    (single / names[0]).write_bytes((folders[1] / names[0]).read_bytes())
+
+    def answers(queries: Path, *, alone: bool) -> dict[str, list[tuple[str, str]]]:
+        rows, _ = run((folders[0], queries), tmp_path / "m.csv", alone=alone)
+        found: dict[str, list[tuple[str, str]]] = {}
+        for row in rows:
+            found.setdefault(row["query"], []).append((row["match"], row["score"]))
+        return found
+
+    together = answers(folders[1], alone=False)
+    turned = answers(reverse, alone=False)
+    assert {name: turned[other] for name, other in renamed.items()} == together
+    one = answers(single, alone=True)
+    assert one[names[0]] == answers(folders[1], alone=True)[names[0]]
+    assert answers(single, alone=False)[names[0]] != together[names[0]]
+
+
 def test_a_small_database_gives_all_it_has(folders: tuple[Path, Path], tmp_path: Path) -> None:
     rows, _ = run(folders, tmp_path / "m.csv", top=20)
     queries = len(list(folders[1].iterdir()))

@@ -60,13 +60,14 @@ def test_small_and_flat_tables() -> None:
     assert reach(3) == pytest.approx([1 + MEMORY + MEMORY**2, 1 + 2 * MEMORY, 1 + MEMORY + MEMORY**2])
 
 
-def test_probabilities_grow_with_evidence_and_are_sure_of_little() -> None:
+@pytest.mark.parametrize("calibration", [confidence.AS_THEY_ARE, confidence.TRAVERSALS])
+def test_probabilities_grow_with_evidence_and_are_sure_of_little(calibration: confidence.Calibration) -> None:
     grid = [
-        [confidence.probability_single(score, inliers) for score in (0.15, 0.3, 0.6)] for inliers in (0, 8, 30, 200)
+        [calibration.probability_single(score, inliers) for score in (0.15, 0.3, 0.6)] for inliers in (0, 8, 30, 200)
     ]
     assert (np.diff(grid, axis=0) > 0).all() and (np.diff(grid, axis=1) > 0).all()
     assert grid[0][0] < 0.01 and grid[-1][-1] > 0.99
-    along = [confidence.probability_along_way(value) for value in (-1, 0, 1, 3, 5)]
+    along = [calibration.probability_along_way(value) for value in (-1, 0, 1, 3, 5)]
     assert (np.diff(along) > 0).all() and along[1] < 0.05 and along[-1] > 0.95
 
 
