@@ -125,7 +125,7 @@ class Service:
 
     def __init__(self, folder: Path, endpoint: str) -> None:
         self.map = folder / "map.seamark"
-        self._endpoint, self._log = endpoint, folder / "serve.log"
+        self._endpoint, self.log = endpoint, folder / "serve.log"
         (folder / "calib.yaml").write_text(calibration(), encoding="utf-8")
         words = [word for option in OPTIONS for word in ("-o", option)]
         self._command = [
@@ -140,10 +140,10 @@ class Service:
         """Start until it is ready; a refusal (the map is still in use) is tried again. Returns seconds taken."""
         began = time.monotonic()
         while time.monotonic() < began + PATIENCE_S:
-            with self._log.open("wb") as log:
+            with self.log.open("wb") as log:
                 self.process = subprocess.Popen(self._command, stdout=log, stderr=subprocess.STDOUT)
             while self.process.poll() is None and time.monotonic() < began + PATIENCE_S:
-                if b"seamark serves" in self._log.read_bytes():
+                if b"seamark serves" in self.log.read_bytes():
                     return time.monotonic() - began
                 time.sleep(0.02)
             self.why()
@@ -152,7 +152,7 @@ class Service:
     def why(self) -> None:
         """Note why the service has ended; one that does not say has broken a promise."""
         assert self.process is not None and self.process.poll() is not None
-        lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
         errors = [line for line in lines if line.startswith("error:")]
         assert errors, f"exit code {self.process.returncode} and no reason: {lines[-5:]}"
         self.said.append(errors[-1])
@@ -265,7 +265,7 @@ def torment(folder: Path, kills: int, seed: int) -> dict[str, object]:
             if victim != "launcher" and rng.random() < 0.3:
                 continue  # the next one dies before this one's successor is there
             lives = partial(is_back, service, load, victim, dead, before + NEW_KEYFRAMES)
-            until(lives, PATIENCE_S, f"no keyframe after the {victim} was killed")
+            until(lives, PATIENCE_S, f"no keyframe after the {victim} was killed; see {service.log}")
             back_s.setdefault(victim, []).append(time.monotonic() - began)
             assert not service.zombies(), "zombies"
         if service.process is not None and service.process.poll() is not None:

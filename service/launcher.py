@@ -34,6 +34,7 @@ STOP_TIMEOUT_S = 4.0  # for all nodes together: 5 s with the launcher's own end,
 STOP_SHARES = {FRONTEND: 0.4, VOCAB: 0.65, BACKEND: 1.0}
 MAX_RESTARTS = 3  # of one node within RESTARTS_WITHIN_S: a crash now and then in months is none too many
 RESTARTS_WITHIN_S = 600.0
+PROGRESS_EVERY_S = 0.1
 # More keyframes than a front end can have announced without having handed them over.
 LOST_KEYFRAMES = 4 * KEYFRAME.depth
 # One thread per process and library: OpenCV, BLAS and OpenMP would otherwise fight for the same cores.
@@ -245,7 +246,8 @@ class Launcher:
             return
         self._restarted_at[child.name] = [*lately, now]
         logger.warning("%s; it is started again", sentence)
-        self._settings = replace(self._settings, restore=self._settings.map_path is not None)
+        with self._lock:
+            self._settings = replace(self._settings, restore=self._settings.map_path is not None)
         if child.name == FRONTEND:
             self._counting_on(LOST_KEYFRAMES)
         with self._lock:
@@ -261,14 +263,24 @@ class Launcher:
         """
         keyframe_id, session = self._settings.first_keyframe_id, self._settings.first_session
         for node in (VOCAB, BACKEND):
+            counters = self._progress_of(node)
+            keyframe_id = max(keyframe_id, counters.get("next_keyframe_id", 0))
+            session = max(session, counters.get("next_session", 0))
+        with self._lock:
+            self._settings = replace(self._settings, first_keyframe_id=keyframe_id + margin, first_session=session)
+
+    def _progress_of(self, node: str) -> Mapping[str, int]:
+        """Return a node's counters, however long that takes: it may have died too, and a number that is given again
+        would be taken for a keyframe that is known.
+        """
+        while not (self._stopping or self._failure or self._interrupted()):
             try:
                 status: Status = self.bus.request(PROGRESS[node], Empty())
+                return status.counters
             except BusError as error:
-                logger.warning("the %s node does not say how far it is: %s", node, error)
-                continue
-            keyframe_id = max(keyframe_id, status.counters.get("next_keyframe_id", 0))
-            session = max(session, status.counters.get("next_session", 0))
-        self._settings = replace(self._settings, first_keyframe_id=keyframe_id + margin, first_session=session)
+                logger.debug("the %s node does not say how far it is: %s", node, error)
+                time.sleep(PROGRESS_EVERY_S)
+        return {}
 
     def _stop_child(self, name: str, deadline: float) -> None:
         with self._lock:

@@ -167,3 +167,14 @@ def _is_zombie(process_id: int) -> bool:
         return ") Z " in Path(f"/proc/{process_id}/stat").read_text(encoding="ascii")
     except OSError:
         return True
+
+
+def test_a_front_end_counts_on_also_when_the_others_died_with_it(tmp_path: Path) -> None:
+    """Test: all three killed at once. Expected: the next front end waits for the others' numbers, and repeats none."""
+    with launch(tmp_path) as launcher:
+        for node in NODES:
+            os.kill(launcher.process_id(node), signal.SIGKILL)
+        wait_until(lambda: launcher.restarts == dict.fromkeys(NODES, 1))
+        launcher.wait_until_alive()
+        counters = launcher.bus.request(STATUS[FRONTEND], Empty(), PATIENCE_S).counters
+        assert counters["first"] == 7 + LOST_KEYFRAMES
