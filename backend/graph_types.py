@@ -88,8 +88,13 @@ class Solver(Protocol):
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed."""
 
-    def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
-        """Take in a graph that was solved before, with the poses of all nodes, and solve nothing."""
+    def restore(
+        self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
+    ) -> None:
+        """Take in a graph that was solved before, with the poses of all nodes, and solve nothing.
+
+        With ``held`` these poses stay for good: what comes later is fitted to them.
+        """
 
     def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
         """Take in another graph, as ``restore`` does, in place of all that was told before."""

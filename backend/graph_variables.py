@@ -31,9 +31,9 @@ class PoseVariables:
         out[:, :3, 3] = rows[:, 9:]
         return out
 
-    def prior(self, keyframe_id: int, M: Matrix) -> gtsam.NonlinearFactor:
-        """Hold the first pose of a component."""
-        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._config.prior_sigma)
+    def prior(self, keyframe_id: int, M: Matrix, sigma: float | None = None) -> gtsam.NonlinearFactor:
+        """Hold a pose, the first of a component unless ``sigma`` (rad, length) says how firmly."""
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma or self._config.prior_sigma)
         return gtsam.PriorFactorPose3(keyframe_id, self.value(M), noise)
 
     def odometry(self, previous_id: int, node: Node, motion: Matrix, covariance: Matrix) -> gtsam.NonlinearFactor:
@@ -82,9 +82,9 @@ class PlanarVariables(PoseVariables):
         out[:, 0, 3], out[:, 1, 3] = x, y
         return out
 
-    def prior(self, keyframe_id: int, M: Matrix) -> gtsam.NonlinearFactor:
-        """Hold the first pose of a component."""
-        noise = gtsam.noiseModel.Isotropic.Sigma(3, self._config.prior_sigma)
+    def prior(self, keyframe_id: int, M: Matrix, sigma: float | None = None) -> gtsam.NonlinearFactor:
+        """Hold a pose, the first of a component unless ``sigma`` (rad, length) says how firmly."""
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma or self._config.prior_sigma)
         return gtsam.PriorFactorPose2(keyframe_id, self.value(M), noise)
 
     def odometry(self, previous_id: int, node: Node, motion: Matrix, covariance: Matrix) -> gtsam.NonlinearFactor:
@@ -125,9 +125,9 @@ class SimilarityVariables(PoseVariables):
             row[:3, 3] = value.scale() * value.translation()
         return out
 
-    def prior(self, keyframe_id: int, M: Matrix) -> gtsam.NonlinearFactor:
-        """Hold the first pose and the scale of a component."""
-        noise = gtsam.noiseModel.Isotropic.Sigma(7, self._config.prior_sigma)
+    def prior(self, keyframe_id: int, M: Matrix, sigma: float | None = None) -> gtsam.NonlinearFactor:
+        """Hold a pose and its scale, the first of a component unless ``sigma`` says how firmly."""
+        noise = gtsam.noiseModel.Isotropic.Sigma(7, sigma or self._config.prior_sigma)
         return gtsam.PriorFactorSimilarity3(keyframe_id, self.value(M), noise)
 
     def odometry(self, previous_id: int, node: Node, motion: Matrix, covariance: Matrix) -> gtsam.NonlinearFactor:

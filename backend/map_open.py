@@ -14,10 +14,10 @@ def loader(store: MapStore) -> Callable[[int], Keyframe]:
     return lambda keyframe_id: store.keyframe(keyframe_id, (FEATURES,))
 
 
-def restore(slam: Slam, store: MapStore) -> tuple[list[Keyframe], list[Keyframe]]:
+def restore(slam: Slam, store: MapStore, *, held: bool = False) -> tuple[list[Keyframe], list[Keyframe]]:
     """Take in what has been mapped; return these keyframes and those that are stored but wait to be mapped.
 
-    The former are without features, the latter whole.
+    The former are without features, the latter whole. ``held``: poses of the map are never changed.
     """
     meta = store.meta()
     mapped = int(meta.get(MAPPED, -1))
@@ -27,5 +27,5 @@ def restore(slam: Slam, store: MapStore) -> tuple[list[Keyframe], list[Keyframe]
     if before:
         loops = [loop for loop in store.load_loops() if loop.query_id <= mapped and loop.match_id <= mapped]
         revision = int(meta.get("revision", 0))
-        slam.restore(before, loops, store.load_poses(), revision, store.load_spans(), store.load_means())
+        slam.restore(before, loops, store.load_poses(), revision, store.load_spans(), store.load_means(), held=held)
     return before, waiting

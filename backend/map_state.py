@@ -75,6 +75,12 @@ class MapState:
         for keyframe_id in since:
             self._hang(self.keyframes[keyframe_id], self._previous[keyframe_id])
 
+    @property
+    def localised(self) -> bool:
+        """Return whether the newest session lies in the frame of an earlier one, or is the first."""
+        newest = max(self._components, default=0)
+        return self._components.get(newest) != newest or newest == min(self._components)
+
     def components(self) -> dict[int, int]:
         """Return for each session the one in whose frame of reference its poses are."""
         return dict(self._components)

@@ -16,6 +16,7 @@ from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
 _FIRST_ROWS = 1024
+HELD_SIGMA = 1e-5  # rad and units of length: nothing that is measured moves such a pose
 
 
 class PoseGraph:
@@ -50,6 +51,7 @@ class PoseGraph:
         self._variables: PoseVariables = self._kind(self._config, self._drift)
         self._isam: gtsam.ISAM2 | None = None
         self._solved_rows = 0  # those that iSAM2 knows
+        self._held_rows = 0  # those whose poses are given
         self._new_loops: list[Key] = []
         self._requested = False
 
@@ -76,8 +78,13 @@ class PoseGraph:
             self._poses = np.concatenate([self._poses, self._poses])
         self._poses[row] = node.T_odom_cam if before < 0 else self._poses[before] @ self._motion(row)
 
-    def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
-        """Take in a graph that was solved before, with the poses of all nodes: nothing is solved until it has to be."""
+    def restore(
+        self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
+    ) -> None:
+        """Take in a graph that was solved before, with the poses of all nodes: nothing is solved until it has to be.
+
+        With ``held`` these poses stay for good, and what joins them with each other is of no more use.
+        """
         for node in nodes:
             self.add_keyframe(node)
         poses = estimate.T_map_cam.copy()
@@ -89,6 +96,7 @@ class PoseGraph:
         for constraint in constraints:
             self.add_loop(constraint)
         self._revision = estimate.revision
+        self._held_rows = len(self._nodes) if held else 0
 
     def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
         """Take in another graph, as ``restore`` does, in place of all that was told before."""
@@ -226,10 +234,13 @@ class PoseGraph:
     def _factors(self, rows: Sequence[int], loops: Iterable[Key]) -> gtsam.NonlinearFactorGraph:
         """Return the factors that these keyframes and loops bring."""
         graph = gtsam.NonlinearFactorGraph()
-        joined = [row for row in rows if self._before[row] >= 0]
+        held = self._held_rows
+        joined = [row for row in rows if self._before[row] >= 0 and row >= held]
         for row in rows:
             node = self._nodes[row]
-            if self._before[row] < 0 and self._frames[node.session] == node.session:
+            if row < held:
+                graph.add(self._variables.prior(node.id, self._poses[row], HELD_SIGMA))
+            elif self._before[row] < 0 and self._frames[node.session] == node.session:
                 graph.add(self._variables.prior(node.id, self._poses[row]))
         if joined:
             nodes, previous = (
@@ -240,7 +251,7 @@ class PoseGraph:
             for before, node, motion, covariance in zip(previous, nodes, motions, covariances, strict=True):
                 graph.add(self._variables.odometry(before.id, node, motion, covariance))
         for key in loops:
-            if key in self._loops:
+            if key in self._loops and max(self._rows[number] for number in key) >= held:
                 graph.add(self._variables.loop(self._loops[key]))
         return graph
 

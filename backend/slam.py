@@ -72,6 +72,15 @@ class Slam:
         return keyframe_id in self._map.keyframes
 
     @property
+    def localised(self) -> bool:
+        """Return whether the newest session lies in the frame of reference of an earlier one, or is the first of all
+        (true where there are no poses).
+
+        Until it does, the map is a prior to it and says nothing of where it is.
+        """
+        return self._solver is None or self._map.localised
+
+    @property
     def feature_bytes(self) -> int:
         """Return how many bytes the features in memory take."""
         return self._memory.n_bytes
@@ -127,11 +136,13 @@ class Slam:
         revision: int = 0,
         spans: Mapping[int, Span] | None = None,
         means: Mapping[Key, Mean] | None = None,
+        *,
+        held: bool = False,
     ) -> None:
         """Take in what a map on disk holds (keyframes in order of id, features or not), accepted loops unasked.
 
         With ``poses``, those of the map at ``revision``, nothing is solved; without, all is. ``spans`` and ``means``
-        are what the map has of keyframes that have gone.
+        are what the map has of keyframes that have gone. ``held``: these poses are never changed.
         """
         poses, spans = poses or {}, spans or {}
         self._means = dict(means or {})
@@ -148,9 +159,12 @@ class Slam:
         if poses and self._solver is not None:
             self._map.revision = revision
             constraints = [constraint for constraint in accepted.values() if constraint is not None]
-            self._solver.restore([node for node in nodes if node is not None], constraints, self._map.estimate())
+            known = [node for node in nodes if node is not None]
+            self._solver.restore(known, constraints, self._map.estimate(), held=held)
             self._committed |= set(accepted)
-            self._unsolved = bool(accepted)  # loops may have come after the last solution: the next keyframe asks
+            self._unsolved = (
+                bool(accepted) and not held
+            )  # loops may have come after the last solution: the next keyframe asks
             return
         for node in nodes:
             if self._solver is not None and node is not None:

@@ -64,13 +64,15 @@ class SolverProcess:
         self._keyframes.add(node.id)
         self._told.append(("add_keyframe", (node,)))
 
-    def restore(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
-        """Take in a graph that was solved before; the child hears of it when it is first needed."""
+    def restore(
+        self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
+    ) -> None:
+        """Take in a graph that was solved before, ``held`` or not; the child hears of it when it is first needed."""
         for node in nodes:
             check_node(node)
         self._keyframes |= {node.id for node in nodes}
         self._loops |= {constraint.key for constraint in constraints}
-        self._told.append(("restore", (nodes, constraints, estimate)))
+        self._told.append(("restore", (nodes, constraints, estimate, held)))
         self._revision = estimate.revision
 
     def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:

@@ -193,7 +193,7 @@ class Service:
 
     def left_over(self) -> list[psutil.Process]:
         """Return processes of earlier services that are still there."""
-        return [one for one in self._family if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+        return [one for one in self._family if _is_alive(one)]
 
     def stop(self) -> float:
         """Stop it with SIGTERM and return how long that takes."""
@@ -202,6 +202,13 @@ class Service:
         self.process.send_signal(signal.SIGTERM)
         self.process.wait(PATIENCE_S)
         return time.monotonic() - began
+
+
+def _is_alive(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def until(condition: Callable[[], object], patience_s: float, what: str) -> float:

@@ -86,6 +86,9 @@ def run_command(
     map_file: Annotated[
         Path | None, typer.Option("--map", help="A map to go on with; it is copied and stays as it is.")
     ] = None,
+    localise_only: Annotated[
+        bool, typer.Option("--localise-only", help="Find the frames in the map of --map, and learn nothing.")
+    ] = False,
     as_json: JsonOption = False,
     override: OverrideOption = None,
     config: ConfigOption = None,
@@ -95,9 +98,11 @@ def run_command(
     from seamark.service.run import RunOptions, for_mode, run
     from seamark.service.sources.open import open_sources
 
+    if localise_only and map_file is None:
+        raise typer.BadParameter("it needs --map", param_hint="--localise-only")
     settings = _config(config, override, seed)
     source = open_sources(sources, mode=mode, calib=calib, fps=fps)
-    options = RunOptions(out, tuple(sources), vocab, not no_loops, in_process, realtime, map_file)
+    options = RunOptions(out, tuple(sources), vocab, not no_loops, in_process, realtime, map_file, localise_only)
     with Bar(source.name) as bar:
         record = run(source, options, settings, bar)
     report = build_report(record, for_mode(settings, record.mode))

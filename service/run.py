@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from seamark.backend.errors import MapError
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import MapSnapshot
 from seamark.frontend.types import Frame, Mode, Odometry
@@ -38,7 +39,8 @@ class RunOptions:
 
     ``in_process`` puts the nodes on a LocalBus, so that two runs give equal trajectories and tables. ``realtime`` sends
     frames no faster than their stamps say. ``vocabulary`` None is the one that ships with Seamark. ``sources`` are
-    named in the report. ``map_path`` is a map to go on with: the run works on a copy in ``out`` and leaves it as it is.
+    named in the report. ``map_path`` is a map to go on with: the run works on a copy in ``out`` and leaves it as it is;
+    with ``localise_only`` it makes none, finds the frames' poses in that map, and leaves no map.
     """
 
     out: Path
@@ -48,6 +50,7 @@ class RunOptions:
     in_process: bool = False
     realtime: bool = False
     map_path: Path | None = None
+    localise_only: bool = False
 
 
 def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Progress | None = None) -> RunRecord:
@@ -57,16 +60,23 @@ def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Pr
     a folder that cannot be written to.
     """
     with prepare_output(options.out) as output:
-        if options.map_path is not None:
+        map_path = output.staging / MAP_FILE
+        if options.localise_only:
+            if options.map_path is None:
+                raise MapError("to localise only, a map is needed")
+            map_path = options.map_path
+        elif options.map_path is not None:
             with MapStore(options.map_path, read_only=True) as store:
-                store.copy(output.staging / MAP_FILE)
+                store.copy(map_path)
         settings = NodeSettings(
             mode=source.mode,
             rig=source.rig,
             config=for_mode(config, source.mode),
             vocabulary=options.vocabulary,
-            map_path=output.staging / MAP_FILE,
+            map_path=map_path,
             no_loops=not options.loops,
+            localise_only=options.localise_only,
+            passing=options.localise_only,
             solver_process=not options.in_process,
         )
         record = _run_nodes(source, options, settings, output, progress)
@@ -106,7 +116,7 @@ def _run_nodes(
             sources=options.sources,
             mode=source.mode,
             odometry=odometry,
-            keyframes=_keyframes(output.staging / MAP_FILE, recorder),
+            keyframes=_passed(odometry) if options.localise_only else _keyframes(output.staging / MAP_FILE, recorder),
             snapshot=snapshot,
             ground_truth=source.ground_truth,
             processes=usage,
@@ -220,6 +230,15 @@ def _usage(ended: tuple[ProcessUsage, ...], statuses: dict[str, Status]) -> tupl
     """
     nodes = [ProcessUsage(one.name, statuses[one.name].peak_rss_bytes, one.cpu_s) for one in ended]
     return (*nodes, own_usage())
+
+
+def _passed(odometry: tuple[Odometry, ...]) -> tuple[KeyframeSummary, ...]:
+    """Return the keyframes of a run that leaves no map."""
+    return tuple(
+        KeyframeSummary(one.keyframe_id, one.session, one.index, one.stamp_ns, one.file)
+        for one in odometry
+        if one.keyframe_id is not None
+    )
 
 
 def _keyframes(map_path: Path, recorder: Recorder) -> tuple[KeyframeSummary, ...]:

@@ -40,7 +40,7 @@ class BackendNode:
 
     A keyframe is acknowledged when it is on disk, candidates when their keyframe has been mapped. With ``no_loops``
     candidates are ignored. What ``store`` holds already is taken in first. ``solver`` is closed with the node.
-    ``patient`` and ``frozen``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`.
+    ``patient``, ``frozen`` and ``passing``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`.
     """
 
     def __init__(
@@ -55,11 +55,14 @@ class BackendNode:
         solver: Solver | None = None,
         patient: bool = False,
         frozen: bool = False,
+        passing: bool = False,
         limits: MapConfig | None = None,
     ) -> None:
         self._bus, self._slam, self._no_loops, self._solver = bus, slam, no_loops, solver
         self._meter = Meter(bus.node)
-        self._keeper = None if store is None else MapKeeper(store, self._meter, patient=patient, frozen=frozen)
+        self._keeper = None
+        if store is not None:
+            self._keeper = MapKeeper(store, self._meter, patient=patient, frozen=frozen, passing=passing)
         self._pruner = None
         if self._keeper is not None:
             self._pruner = MapPruner(self._keeper, slam, limits or MapConfig(), self._meter, self._forget)
@@ -71,7 +74,7 @@ class BackendNode:
         self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
         self._candidates: dict[int, tuple[Candidates, Future[None]]] = {}
         if store is not None:
-            self._restore(store)
+            self._restore(store, held=passing)
         place_service = PlaceService(places, camera, self._rank, slam.locate)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
@@ -116,9 +119,9 @@ class BackendNode:
         if self._solver is not None:
             self._solver.close()
 
-    def _restore(self, store: MapStore) -> None:
+    def _restore(self, store: MapStore, held: bool) -> None:
         """Take in the map from before; keyframes stored and not yet mapped wait for their candidates again."""
-        before, waiting = restore(self._slam, store)
+        before, waiting = restore(self._slam, store, held=held)
         for keyframe in (*before, *waiting):
             self._remember(keyframe)
         self._waiting |= {keyframe.id: keyframe for keyframe in waiting}
@@ -150,6 +153,7 @@ class BackendNode:
 
     def _status(self) -> Status:
         self._meter.keep("feature_bytes", self._slam.feature_bytes)
+        self._meter.keep("localised", int(self._slam.localised))
         return self._meter.status()
 
     def _refuse(self, keyframe_id: int) -> None:
@@ -249,6 +253,7 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
             solver=solver,
             patient=settings.patient,
             frozen=settings.localise_only,
+            passing=settings.passing,
             limits=config.backend.map,
         )
     except BaseException:

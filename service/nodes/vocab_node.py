@@ -29,15 +29,23 @@ STOP_PATIENCE_S = 0.5
 class VocabNode:
     """Asks the index about every keyframe, then adds it; answers query images without adding them.
 
-    ``index`` holds the places of the map from before; ``cache``, where there is one, keeps it in a file.
+    ``index`` holds the places of the map from before; ``cache``, where there is one, keeps it in a file. Where the
+    index is ``frozen``, nothing is added.
     """
 
     def __init__(
-        self, bus: Bus, index: PlaceIndex, cache: PlacesCache | None = None, meter: Meter | None = None
+        self,
+        bus: Bus,
+        index: PlaceIndex,
+        cache: PlacesCache | None = None,
+        meter: Meter | None = None,
+        *,
+        frozen: bool = False,
     ) -> None:
         self._bus = bus
         self._index = index
         self._cache = cache
+        self._frozen = frozen
         self._meter = meter or Meter(bus.node)
         self._lock = threading.Lock()  # queries have a thread of their own: sending keyframes on may take a while
         self._next_keyframe_id = 0
@@ -69,8 +77,8 @@ class VocabNode:
         observation = observe(keyframe)
         with self._lock, self._meter.timed("rank"):
             known = keyframe.id in self._index  # sent again after a restart
-            candidates = self._index.query(observation) if known else self._index.step(observation)
-            if self._cache is not None and not known:
+            candidates = self._index.query(observation) if known or self._frozen else self._index.step(observation)
+            if self._cache is not None and not known and not self._frozen:
                 self._cache.changed(self._index)
         self._meter.count("keyframes_again" if known else "keyframes")
         self._next_keyframe_id = max(self._next_keyframe_id, observation.id + 1)
@@ -124,7 +132,7 @@ def build(bus: Bus, settings: NodeSettings) -> VocabNode:
     cache = PlacesCache(cache_path(settings.map_path), meter, described) if kept else None
     if cache is not None:
         cache.write_if_due(index)
-    return VocabNode(bus, index, cache, meter)
+    return VocabNode(bus, index, cache, meter, frozen=settings.localise_only)
 
 
 if __name__ == "__main__":

@@ -4,17 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from seamark.backend.errors import MapError
 from seamark.datasets_synth.toy import ToyWorld, toy_sequence
 from seamark.frontend.features import extract_features
 from seamark.frontend.types import Frame, Mode
-from seamark.service import topics
+from seamark.service import topics, trajectories
 from seamark.service.config import load_config
 from seamark.service.launcher import Launcher, NodeFailedError
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty, PlaceQuery
+from seamark.service.run import RunOptions, run
 from seamark.service.serve import ServeOptions, serve
 from seamark.vocab.training import train
 
@@ -38,7 +40,7 @@ def test_a_service_that_only_localises_never_writes(tmp_path: Path) -> None:
             launcher.bus.request(topics.FRAME, frame, 60.0)
         for node in topics.NODES:
             launcher.bus.request(topics.DRAIN[node], Empty(), 60.0)
-    before = {one.name: (one.read_bytes(), one.stat().st_mtime_ns) for one in folder.iterdir()}
+    before = contents(folder)
     with Launcher(replace(settings, localise_only=True)) as launcher:
         odometry = [launcher.bus.request(topics.FRAME, frame, 60.0) for frame in frames]
         for number in (4, 20, 33):
@@ -51,7 +53,42 @@ def test_a_service_that_only_localises_never_writes(tmp_path: Path) -> None:
         left_out = launcher.bus.request(topics.STATUS["frontend"], Empty()).counters["keyframes_left_out"]
         assert 2 < left_out <= sum(one.keyframe_id is not None for one in odometry)
         assert {one.name for one in folder.iterdir()} == set(before)
-    assert {one.name: (one.read_bytes(), one.stat().st_mtime_ns) for one in folder.iterdir()} == before
+    assert contents(folder) == before
+
+
+@pytest.mark.zenoh
+def test_a_run_that_only_localises_finds_its_frames_in_an_old_map(tmp_path: Path) -> None:
+    """Test: the way of the map driven again, through a frame of its own. Expected: poses of the map, which stays."""
+    config = load_config(overrides=["frontend.keyframe_parallax_px=8", "service.record=false"])
+    old = tmp_path / "old"
+    first = run(toy_sequence("loop", 40, SEED, Mode.RGBD), RunOptions(old, ("toy",), in_process=True), config)
+    path, before = old / "map.seamark", contents(old)
+    sequence = toy_sequence("loop", 40, SEED, Mode.RGBD)
+    options = RunOptions(tmp_path / "new", ("toy",), map_path=path, localise_only=True)
+    second = run(sequence, options, config)
+    assert contents(old) == before
+    assert "map.seamark" not in contents(tmp_path / "new")
+    # The poses of the map are what they were, to the bit, and the session lies in its frame.
+    count = len(first.snapshot.keyframe_ids)
+    assert len(second.keyframes) > 3 and min(one.id for one in second.keyframes) == count
+    np.testing.assert_allclose(second.snapshot.T_map_cam[:count], first.snapshot.T_map_cam, atol=1e-6)
+    assert set(second.snapshot.components.tolist()) == {0} and set(second.snapshot.sessions.tolist()) == {0, 1}
+    assert all(loop.match_id < count for loop in second.snapshot.loops)
+    there, here = trajectories.corrected(first), trajectories.corrected(second)
+    assert len(here) == len(there) == 40
+    apart = np.linalg.norm(here.T_world_cam[:, :3, 3] - there.T_world_cam[:, :3, 3], axis=1)
+    assert 0 < apart.max() < 0.05
+
+
+def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
+    return {one.name: (one.read_bytes(), one.stat().st_mtime_ns) for one in folder.iterdir()}
+
+
+def test_a_run_cannot_localise_without_a_map(tmp_path: Path) -> None:
+    options = RunOptions(tmp_path / "new", ("toy",), in_process=True, localise_only=True)
+    with pytest.raises(MapError, match="a map is needed"):
+        run(toy_sequence("loop", 3, SEED, Mode.RGBD), options, load_config())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_serve_says_at_once_that_there_is_no_map_to_localise_in(tmp_path: Path) -> None:
