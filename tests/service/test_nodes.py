@@ -76,7 +76,7 @@ class FakeSlam:
         self.finished += 1
         return StepResult((), 0, True)
 
-    def restore(self, keyframes: list[Keyframe], loops: list[Loop], *_: object) -> None:
+    def restore(self, keyframes: list[Keyframe], loops: list[Loop], *_: object, held: bool = False) -> None:
         self.restored = [one.id for one in keyframes], [(loop.query_id, loop.match_id) for loop in loops]
 
     def snapshot(self) -> MapSnapshot:
