@@ -57,8 +57,8 @@ def _estimate(
 ) -> PoseEstimate | None:
     """Estimate the pose from key points of another view, which blur and fewer pixels make less precise than tracks.
 
-    They are taken as such first: among imprecise ones a few agree by chance on a pose that is wrong. The error of a track
-    is asked for where most of them keep it.
+    They are taken as such first: among imprecise ones a few agree by chance on a pose that is wrong. The error of a
+    track is asked for where most of them keep it.
     """
 
     def within(threshold_px: float, start: PoseEstimate | None) -> PoseEstimate | None:
