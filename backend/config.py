@@ -104,9 +104,7 @@ class DriftConfig(_Section):
     scale_per_keyframe: float = Field(
         default=0.02, gt=0, description="mono: standard deviation of log scale per root keyframe"
     )
-    horizon_keyframes: int = Field(
-        default=30, ge=1, description="keyframes over which white noise shall equal the bias"
-    )
+    horizon_keyframes: int = Field(default=3, ge=1, description="keyframes over which white noise shall equal the bias")
     floor_rotation_deg: float = Field(
         default=0.02, gt=0, description="least standard deviation of one motion's rotation"
     )
@@ -144,7 +142,7 @@ class ConsistencyConfig(_Section):
         description="chance to pass below which a loop alone is accepted",
     )
     contest_ratio: float = Field(
-        default=2.0, ge=1, description="how much heavier than what contradicts it an accepted group must be"
+        default=1.5, ge=1, description="how much heavier than what contradicts it an accepted group must be"
     )
 
 

@@ -56,7 +56,7 @@ class PoseJudge:
         # What joins an accepted group is accepted with it; a group that is confirmed by now calls for a judgement.
         called = [group for group in entered if not group.accepted and self._groups.confirmed(group)]
         if len(called) == 1 and self._admissible(called[0], self._way(called[0], self._groups.accepted())):
-            called[0].accepted = not self._leans(called[0], self._nearest_groups(called))
+            called[0].accepted = not self._leans(called[0])
         elif called:
             self._choose(self._nearest_groups(called))
         moved = any(before.get(number) != self._verdict(group) for number, group in self._groups.by_number.items())
@@ -121,7 +121,7 @@ class PoseJudge:
             group.contested = group.number in contested
             group.contradicted = not group.accepted and not self._closes(self._way(group, chosen))
         for group in sorted(groups, key=lambda group: (group.weight, group.number)):
-            group.accepted = group.accepted and not self._leans(group, groups)
+            group.accepted = group.accepted and not self._leans(group)
 
     def _drop_contradictory(self, chosen: set[int], free: set[int]) -> None:
         """Take groups out of ``chosen`` until all ways close, each time the one that costs least."""
@@ -172,13 +172,15 @@ class PoseJudge:
             else 0.0
         )
 
-    def _leans(self, group: Group, groups: Sequence[Group]) -> bool:
-        """Return whether a group rests on the margin of odometry alone, among groups that show this to be no proof."""
+    def _leans(self, group: Group) -> bool:
+        """Return whether a group rests on the margin of odometry alone, where others show this to be no proof."""
         if group.stretches > SHORT_STRETCHES or group.strain(self._config.gate_chi2) <= MARGIN_SHARE:
             return False
-        refuted = sum(other.contradicted or other.contested for other in groups)
         accepted = self._groups.accepted()
-        return refuted >= REFUTED_SHARE * len(accepted | {group.number}) and self._backing(group, accepted) == 0
+        around = self._groups.nearest(list(self._groups.by_number.values()), [group])
+        refuted = sum(other.contradicted or other.contested for other in around)
+        standing = sum(other.accepted or other is group for other in around)
+        return refuted >= REFUTED_SHARE * standing and self._backing(group, accepted) == 0
 
     def _hear(self, groups: Sequence[Group]) -> None:
         """Accept lone loops whose evidence is overwhelming; say of the others whether they contradict."""
@@ -186,7 +188,7 @@ class PoseJudge:
             way = self._way(group, self._groups.accepted())
             group.contradicted = not self._closes(way)
             if way is not None and self._chance(way) <= self._config.lone_false_alarm:
-                group.accepted = self._admissible(group, way) and not self._leans(group, self._nearest_groups([group]))
+                group.accepted = self._admissible(group, way) and not self._leans(group)
 
     def _chance(self, way: Way) -> float:
         """Return how probable it is that a wrong loop, any pose over the map alike, closes as tight a cycle."""
