@@ -159,22 +159,23 @@ def white_covariance(node: Node, motion: Matrix, config: DriftConfig) -> Matrix:
     return white_covariances([node], motion[None], config)[0]
 
 
-def white_covariances(nodes: Sequence[Node], motions: Matrix, config: DriftConfig) -> Matrix:
-    """Return the covariances (N, 6, 6) of motions (N, 4, 4) that stand for noise and bias in a graph of white noise."""
+def white_covariances(nodes: Sequence[Node], motions: Matrix, config: DriftConfig, share: float = 1.0) -> Matrix:
+    """Return the covariances (N, 6, 6) of motions (N, 4, 4) that stand for noise and bias in a graph of white noise.
+
+    ``share`` of what is allowed beyond the odometry's own covariances is taken (see drift.py).
+    """
     metric = np.array([node.metric for node in nodes], bool)
     lengths = np.linalg.norm(motions[:, :3, 3], axis=1)
     angles = se3.rotation_angle(motions[:, :3, :3])
     turning = config.rotation_fraction * angles + np.deg2rad(config.rotation_deg_per_keyframe)
     moving = np.where(metric, config.translation_fraction, config.mono_translation_fraction) * lengths
     floor = np.maximum(np.where(metric, config.floor_translation_m, 1e-3 * lengths), 1e-6)
-    horizon = config.horizon_keyframes
-    variances = np.stack(
-        [turning**2 * horizon + np.deg2rad(config.floor_rotation_deg) ** 2, moving**2 * horizon + floor**2]
-    )
-    drift = np.repeat(variances.T, 3, axis=1)[:, :, None] * np.eye(6)
+    horizon = share * config.horizon_keyframes
+    turned = turning**2 * horizon + np.deg2rad(config.floor_rotation_deg) ** 2
+    drift = np.repeat(np.stack([turned, moving**2 * horizon + floor**2], axis=1), 3, axis=1)[:, :, None] * np.eye(6)
     for row, node in enumerate(nodes):
         if node.span is not None:
-            drift[row] = node.span.drift
+            drift[row] = share * node.span.drift
     out = config.covariance_inflation * np.stack([node.covariance for node in nodes]) + drift
     return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 

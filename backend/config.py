@@ -89,7 +89,7 @@ class DriftConfig(_Section):
 
     Visual odometry errs by a slowly varying bias and not by white noise: over a long way the error grows with the
     length and not with its root. Gates take the bias as it is; the graph, which knows white noise only, takes what
-    gives the same error over ``horizon_keyframes``.
+    gives the same error over ``horizon_keyframes``, or the share of it that loops bear out (``graph.learn_drift``).
     """
 
     covariance_inflation: float = Field(default=4.0, ge=1, description="factor on the odometry's covariances")
@@ -104,7 +104,9 @@ class DriftConfig(_Section):
     scale_per_keyframe: float = Field(
         default=0.02, gt=0, description="mono: standard deviation of log scale per root keyframe"
     )
-    horizon_keyframes: int = Field(default=3, ge=1, description="keyframes over which white noise shall equal the bias")
+    horizon_keyframes: int = Field(
+        default=30, ge=1, description="keyframes over which white noise shall equal the bias"
+    )
     floor_rotation_deg: float = Field(
         default=0.02, gt=0, description="least standard deviation of one motion's rotation"
     )
@@ -151,6 +153,9 @@ class GraphConfig(_Section):
 
     cauchy_width: float = Field(
         default=1.0, gt=0, description="width of the robust kernel of loops in standard deviations"
+    )
+    learn_drift: bool = Field(
+        default=True, description="trust odometry more than ``drift`` says where the loops of the map bear it out"
     )
     prior_sigma: float = Field(default=1e-3, ge=1e-4, description="standard deviation of the first pose (rad, m)")
     relinearise_threshold: float = Field(

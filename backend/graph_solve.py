@@ -75,7 +75,7 @@ def graph_config(base: BackendConfig, planar: bool) -> BackendConfig:
     consistency = base.consistency.model_copy(
         update={"gate_chi2": chi2, "pair_chi2": chi2, "support_keyframes": SUPPORT_NODES}
     )
-    graph = base.graph.model_copy(update={"cauchy_width": CAUCHY_WIDTH})
+    graph = base.graph.model_copy(update={"cauchy_width": CAUCHY_WIDTH, "learn_drift": False})
     return base.model_copy(update={"drift": drift, "consistency": consistency, "graph": graph})
 
 

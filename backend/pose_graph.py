@@ -1,14 +1,16 @@
 """All keyframes' poses, from odometry and loops, by GTSAM."""
 
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.chain import white_covariances
+from seamark.backend.chain import OdometryChains, white_covariances
 from seamark.backend.config import BackendConfig, DriftConfig, GraphConfig
 from seamark.backend.consistency import chi_squared, cycle_error, similarity
+from seamark.backend.drift import drift_share
 from seamark.backend.errors import BackendInputError, SolverError
 from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_constraint, check_node
 from seamark.backend.graph_variables import PlanarVariables, PoseVariables, SimilarityVariables
@@ -16,7 +18,8 @@ from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
 _FIRST_ROWS = 1024
-HELD_SIGMA = 1e-5  # rad and units of length: nothing that is measured moves such a pose
+HELD_SIGMA: Final = 1e-5  # rad and units of length: nothing that is measured moves such a pose
+STRETCH: Final = 10  # loops of so many neighbouring keyframes close the same way
 
 
 class PoseGraph:
@@ -53,6 +56,8 @@ class PoseGraph:
         self._solved_rows = 0  # those that iSAM2 knows
         self._held_rows = 0  # those whose poses are given
         self._new_loops: list[Key] = []
+        self._chains = OdometryChains(self._drift)
+        self._share = 1.0  # of the drift allowed for that the loops bear out
         self._requested = False
 
     def add_keyframe(self, node: Node) -> None:
@@ -135,6 +140,7 @@ class PoseGraph:
     def optimise(self, thorough: bool = False) -> Estimate:
         """Return the poses with all loops so far; raises SolverError when no finite solution is found."""
         moved = self._settle_frames()
+        self._learn_drift()
         if moved or thorough:
             self._solve_batch()
         elif self._new_loops or self._isam is None:
@@ -180,6 +186,16 @@ class PoseGraph:
     def _motion(self, row: int) -> Matrix:
         """Return the odometry's motion from the keyframe to its predecessor."""
         return se3.inverse(self._nodes[self._before[row]].T_odom_cam) @ self._nodes[row].T_odom_cam
+
+    def _learn_drift(self) -> None:
+        """Ask the loops how much odometry drifts, when there are new ones."""
+        if not self._config.learn_drift or not self._new_loops:
+            return
+        for node in self._nodes[len(self._chains.nodes()) :]:
+            self._chains.add(node)
+        share = drift_share(list(self._loops.values()), self._chains, STRETCH)
+        if share != self._share:
+            self._share, self._isam = share, None
 
     def _solve_incremental(self) -> None:
         """Update iSAM2 with what is new; fall back on the batch solution when that does not help."""
@@ -247,7 +263,7 @@ class PoseGraph:
                 [self._nodes[row] for row in which] for which in (joined, [self._before[r] for r in joined])
             )
             motions = se3.inverse(np.stack([x.T_odom_cam for x in previous])) @ np.stack([x.T_odom_cam for x in nodes])
-            covariances = white_covariances(nodes, motions, self._drift)
+            covariances = white_covariances(nodes, motions, self._drift, self._share)
             for before, node, motion, covariance in zip(previous, nodes, motions, covariances, strict=True):
                 graph.add(self._variables.odometry(before.id, node, motion, covariance))
         for key in loops:
