@@ -1,8 +1,8 @@
 """Endless varied pictures for training visual words, so that nothing is ever trained on photographs it is tested on.
 
-Four kinds of scenes (rooms, streets, landscapes, and the dead-leaves model of natural images: A. Lee, D. Mumford,
-J. Huang, "Occlusion models for natural images", IJCV 2001) go through the model of a cheap camera: light, shadows,
-blur, noise, JPEG.
+Seven kinds of scenes (rooms, streets, landscapes, structures, ragged layers, thickets, and the dead-leaves model of
+natural images: A. Lee, D. Mumford, J. Huang, "Occlusion models for natural images", IJCV 2001) go through the model of
+a cheap camera: light, shadows, blur, noise, JPEG.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth import outdoors, prints, textures
+from seamark.datasets_synth import outdoors, prints, scenery, textures
 from seamark.datasets_synth.textures import Image, noise, random_colour, to_image
 
 Patch = Callable[[np.random.Generator, int, int], Image]
@@ -139,6 +139,44 @@ def dead_leaves(rng: np.random.Generator, size: tuple[int, int]) -> Image:
     return canvas
 
 
+def structures(rng: np.random.Generator, size: tuple[int, int]) -> Image:
+    """Return what people build, as edges of all sizes: bars, rails, steps, panes and struts in random perspective."""
+    width, height = size
+    canvas = _tunnel(rng, size, scenery.bark if rng.random() < 0.5 else material, material, material, _any_patch)
+    for _ in range(int(rng.integers(6, 25))):
+        patch = _lattice(rng, 160)
+        centre = rng.uniform(0, 1, 2) * (width, height)
+        extent = np.exp(rng.normal(-1.6, 0.6, 2)) * width
+        lean = 1 + rng.uniform(-0.5, 0.5) * np.array([-1, 1, 1, -1])
+        box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * extent / 2
+        canvas = _paste(canvas, patch, centre + box * np.stack([np.ones(4), lean], axis=1))
+    return canvas
+
+
+def _lattice(rng: np.random.Generator, side: int) -> Image:
+    """Return a square of bars across or upright, of panes, or of struts."""
+    patch = np.full((side, side, 3), random_colour(rng, 10, 245, 0.4), np.float32)
+    count, rows = int(rng.integers(1, 14)), int(rng.integers(1, 7))
+    kind = int(rng.integers(4))
+
+    def fill(left: float, top: float, right: float, bottom: float) -> None:
+        corners = [(int(side * x), int(side * y)) for x, y in ((left, top), (right, bottom))]
+        cv2.rectangle(patch, corners[0], corners[1], random_colour(rng, 10, 245, 0.3).tolist(), -1)
+
+    for k in range(count):
+        if kind == 0:
+            fill(0, k / count, 1, (k + rng.uniform(0.2, 0.8)) / count)
+        elif kind == 1:
+            fill(k / count, 0, (k + rng.uniform(0.1, 0.8)) / count, 1)
+        elif kind == 2:
+            for row in range(rows):
+                fill((k + 0.15) / count, (row + 0.15) / rows, (k + 0.8) / count, (row + 0.85) / rows)
+        else:
+            ends = rng.integers(0, side, (2, 2)).tolist()
+            cv2.line(patch, ends[0], ends[1], random_colour(rng, 10, 245, 0.3).tolist(), int(rng.integers(1, 12)))
+    return to_image(patch * (1 + rng.uniform(0.02, 0.12) * noise(rng, side, side, side / 4))[..., None])
+
+
 def photograph(rng: np.random.Generator, scene: Image) -> Image:
     """Return the scene as a cheap camera sees it: muted colours, light and shade, blur, noise, JPEG."""
     height, width = scene.shape[:2]
@@ -165,7 +203,7 @@ def photograph(rng: np.random.Generator, scene: Image) -> Image:
 
 def training_images(seed: int, n: int, size: tuple[int, int] = (640, 480)) -> Iterator[Image]:
     """Yield ``n`` generated BGR uint8 images of ``size`` (width, height); image i depends on ``seed`` and i only."""
-    kinds = (room, street, landscape, dead_leaves)
+    kinds = (room, street, landscape, dead_leaves, structures, scenery.layers, scenery.thicket)
     for index in range(n):
         rng = np.random.default_rng([seed, index, 0x1A6E])
         yield photograph(rng, kinds[index % len(kinds)](rng, size))

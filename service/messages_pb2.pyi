@@ -179,7 +179,7 @@ class Odometry(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., session: _Optional[int] = ..., quality: _Optional[str] = ..., outcome: _Optional[str] = ..., inliers: _Optional[int] = ..., reprojection_px: _Optional[float] = ..., latency_ms: _Optional[float] = ..., T_odom_cam: _Optional[_Union[Array, _Mapping]] = ..., reference_id: _Optional[int] = ..., T_reference_cam: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., keyframe_id: _Optional[int] = ..., filled: _Optional[_Iterable[_Union[Filled, _Mapping]]] = ..., tracks: _Optional[_Union[Array, _Mapping]] = ..., stages_ms: _Optional[_Iterable[_Union[Stage, _Mapping]]] = ..., near_share: _Optional[float] = ..., loss: _Optional[str] = ..., track_ages: _Optional[_Union[Array, _Mapping]] = ..., motion_mask: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class PlaceObservation(_message.Message):
-    __slots__ = ("schema_version", "id", "session", "stamp_ns", "descriptors", "points", "thumbnail")
+    __slots__ = ("schema_version", "id", "session", "stamp_ns", "descriptors", "points", "thumbnail", "scales", "angles")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
@@ -187,6 +187,8 @@ class PlaceObservation(_message.Message):
     DESCRIPTORS_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
     THUMBNAIL_FIELD_NUMBER: _ClassVar[int]
+    SCALES_FIELD_NUMBER: _ClassVar[int]
+    ANGLES_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     id: int
     session: int
@@ -194,7 +196,9 @@ class PlaceObservation(_message.Message):
     descriptors: Array
     points: Array
     thumbnail: Array
-    def __init__(self, schema_version: _Optional[int] = ..., id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., descriptors: _Optional[_Union[Array, _Mapping]] = ..., points: _Optional[_Union[Array, _Mapping]] = ..., thumbnail: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
+    scales: Array
+    angles: Array
+    def __init__(self, schema_version: _Optional[int] = ..., id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., descriptors: _Optional[_Union[Array, _Mapping]] = ..., points: _Optional[_Union[Array, _Mapping]] = ..., thumbnail: _Optional[_Union[Array, _Mapping]] = ..., scales: _Optional[_Union[Array, _Mapping]] = ..., angles: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Candidate(_message.Message):
     __slots__ = ("id", "score", "votes", "jeffrey", "view")

@@ -33,18 +33,25 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class DescribedImage:
-    """What is compared of one image; ``problem`` says in one sentence why nothing is, for an unreadable one."""
+    """What is compared of one image; ``problem`` says in one sentence why nothing is, for an unreadable one.
+
+    ``scales`` (N,) and ``angles`` (N,) float32 are those of all descriptors, pixels and radians.
+    """
 
     name: str
     descriptors: NDArray[np.uint8]
     features: LocalFeatures
     thumbnail: NDArray[np.uint8]
     problem: str | None = None
+    scales: NDArray[np.float32] | None = None
+    angles: NDArray[np.float32] | None = None
 
     def observation(self, place_id: int, session: int, stamp_ns: int = 0) -> PlaceObservation:
         """Return the image as the place index takes it."""
         points = np.zeros((len(self.descriptors), 2), np.float32)
-        return PlaceObservation(place_id, session, stamp_ns, self.descriptors, points, self.thumbnail)
+        return PlaceObservation(
+            place_id, session, stamp_ns, self.descriptors, points, self.thumbnail, self.scales, self.angles
+        )
 
 
 def describe_image(image: NDArray[np.uint8], name: str, config: FrontendConfig) -> DescribedImage:
@@ -66,7 +73,8 @@ def describe_image(image: NDArray[np.uint8], name: str, config: FrontendConfig) 
         sized.shape[1],
         sized.shape[0],
     )
-    return DescribedImage(name, found.descriptors, features, thumbnail_of(image, config.thumbnail_px))
+    thumbnail = thumbnail_of(image, config.thumbnail_px)
+    return DescribedImage(name, found.descriptors, features, thumbnail, None, found.scales, found.angles)
 
 
 def describe_files(
@@ -108,7 +116,7 @@ def available_workers() -> int:
 def _nothing(name: str, problem: str) -> DescribedImage:
     none = np.zeros(0, np.float32)
     features = LocalFeatures(np.zeros((0, 2), np.float32), none, none, np.zeros((0, 128), np.uint8), 1, 1)
-    return DescribedImage(name, features.descriptors, features, np.zeros((1, 1), np.uint8), problem)
+    return DescribedImage(name, features.descriptors, features, np.zeros((1, 1), np.uint8), problem, none, none)
 
 
 def _in_threads(

@@ -94,6 +94,9 @@ def _keyframe(**fields: Any) -> Keyframe:
 def _observation(**fields: Any) -> PlaceObservation:
     if len(fields["descriptors"]) != len(fields["points"]):
         raise MalformedFieldError(f"{len(fields['points'])} points for {len(fields['descriptors'])} descriptors")
+    for name in ("scales", "angles"):
+        if fields[name] is not None and len(fields[name]) != len(fields["descriptors"]):
+            raise MalformedFieldError(f"{len(fields[name])} {name} for {len(fields['descriptors'])} descriptors")
     return PlaceObservation(**fields)
 
 
@@ -223,7 +226,8 @@ SCHEMAS: dict[type, Schema] = {
     PlaceObservation: Schema(
         pb.PlaceObservation,
         {name: Integer() for name in ("id", "session", "stamp_ns")}
-        | {"descriptors": _DESCRIPTORS, "points": _POINTS, "thumbnail": _THUMBNAIL},
+        | {"descriptors": _DESCRIPTORS, "points": _POINTS, "thumbnail": _THUMBNAIL}
+        | dict.fromkeys(("scales", "angles"), Optional(Array(("float32",), (None,)))),
         _observation,
     ),
     Candidates: Schema(

@@ -58,6 +58,11 @@ class VocabConfig(BaseModel):
         default=False,
         description="Keep 64 bits of each feature, so that only features alike within a word vote; 8 bytes more each.",
     )
+    geometry: bool = Field(
+        default=False,
+        description="Of features alike within a word only those vote whose scale and orientation have changed as most "
+        "have; takes signatures, 2 bytes more for each feature.",
+    )
     histogram_bins: int = Field(default=32, ge=4, le=256, description="Bins of each of the six histograms.")
     histogram_sigma_bins: float = Field(
         default=1.0,
@@ -72,4 +77,6 @@ class VocabConfig(BaseModel):
             raise ValueError("votes_weight, histogram_weight and view_weight must not all be 0")
         if self.signatures and self.soft_words > 1:
             raise ValueError("signatures belong to the nearest word: soft_words must be 1 with them")
+        if self.geometry and not self.signatures:
+            raise ValueError("geometry refines the votes of signatures: signatures must be true with it")
         return self

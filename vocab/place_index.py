@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from seamark.vocab import histogram, index_file, signatures, view
 from seamark.vocab.config import VocabConfig
-from seamark.vocab.errors import DuplicatePlaceError, IndexFileError, UnknownPlaceError
+from seamark.vocab.errors import DuplicatePlaceError, IndexFileError, ObservationError, UnknownPlaceError
 from seamark.vocab.histogram import Histograms
 from seamark.vocab.inverted_index import InvertedIndex
 from seamark.vocab.types import Candidate, Candidates, PlaceObservation
@@ -31,13 +31,16 @@ class PlaceIndex:
     the view; see VocabConfig for the weights. It depends on two images alone, so that rankings of shards merge. The
     recent past of the image's own session is never a candidate, by time, by number and for as long as the view has
     hardly changed, nor is the image itself. With ``config.signatures`` only features vote that are alike within their
-    word (Hamming embedding).
+    word (Hamming embedding), with ``config.geometry`` only those of them whose scale and orientation have changed as
+    most have (weak geometric consistency).
     """
 
     def __init__(self, vocabulary: Vocabulary, config: VocabConfig | None = None) -> None:
         self.vocabulary = vocabulary
         self.config = config or VocabConfig()
-        self._inverted = InvertedIndex(vocabulary.idf, with_signatures=self.config.signatures)
+        self._inverted = InvertedIndex(
+            vocabulary.idf, with_signatures=self.config.signatures, with_geometry=self.config.geometry
+        )
         self._directions = signatures.directions(vocabulary) if self.config.signatures else None
         self._slot_of: dict[int, int] = {}
         self._added_to: dict[int, int] = {}  # session -> places ever added to it
@@ -165,9 +168,10 @@ class PlaceIndex:
             raise IndexFileError(f"{path}: made with the vocabulary {made}, not with {given}")
         index = cls(vocabulary, config)
         index._inverted = opened.inverted_index(vocabulary.idf)
-        if index._inverted.with_signatures != index.config.signatures:
-            made = "with" if index._inverted.with_signatures else "without"
-            raise IndexFileError(f"{path}: made with other settings: {made} signatures")
+        for name in ("signatures", "geometry"):
+            there = getattr(index._inverted, f"with_{name}")
+            if there != getattr(index.config, name):
+                raise IndexFileError(f"{path}: made with other settings: {'with' if there else 'without'} {name}")
         for name, (kind, _) in (index._table.dtype.fields or {}).items():
             shape = opened.array(f"table.{name}", verify=False).shape
             if shape != (index._inverted.n_slots, *kind.shape):
@@ -207,11 +211,13 @@ class PlaceIndex:
         words, signed = np.ascontiguousarray(nearest[:, 0]), None
         if self._directions is not None:
             signed = signatures.sign(descriptors, self.vocabulary.words, words, self._directions)
-        return _Looks(words, nearest[nearest >= 0], signed, histograms, view.describe(observation.thumbnail))
+        geometry = _geometry(observation)[: len(words)] if self.config.geometry else None
+        views = view.describe(observation.thumbnail)
+        return _Looks(words, nearest[nearest >= 0], signed, geometry, histograms, views)
 
     def _insert(self, observation: PlaceObservation, looks: "_Looks") -> None:
         with self._changing:
-            slot = self._inverted.add(looks.words, looks.signatures)
+            slot = self._inverted.add(looks.words, looks.signatures, looks.geometry)
             if slot >= len(self._table):
                 more = max(64, len(self._table) // 2)
                 self._table = np.concatenate([self._table, np.zeros(more, self._table.dtype)])
@@ -250,7 +256,7 @@ class PlaceIndex:
     def _votes(self, looks: "_Looks") -> NDArray[np.float32]:
         if looks.signatures is None:
             return self._inverted.votes(looks.soft_words, looks.words)
-        return self._inverted.near_votes(looks.words, looks.signatures, NEAR_VOTES)
+        return self._inverted.near_votes(looks.words, looks.signatures, NEAR_VOTES, looks.geometry)
 
     def _fuse(
         self, votes: NDArray[np.float64], jeffrey: NDArray[np.float64], likeness: NDArray[np.float64]
@@ -287,8 +293,18 @@ class _Looks:
     words: NDArray[np.int32]
     soft_words: NDArray[np.int32]  # with soft assignment several of each feature
     signatures: NDArray[np.uint64] | None
+    geometry: NDArray[np.uint16] | None
     histograms: Histograms
     view: View
+
+
+def _geometry(observation: PlaceObservation) -> NDArray[np.uint16]:
+    for name in ("scales", "angles"):
+        values, n = getattr(observation, name), len(observation.descriptors)
+        if values is None or values.shape != (n,) or values.dtype != np.float32 or not np.isfinite(values).all():
+            raise ObservationError(f"{name} must be ({n},) float32 and finite where the index compares geometry")
+    assert observation.angles is not None and observation.scales is not None
+    return signatures.geometry(observation.angles, observation.scales)
 
 
 def _place_type(bins: int) -> np.dtype[Any]:

@@ -11,7 +11,8 @@ class PlaceObservation:
     """What one keyframe shows, as far as place recognition goes.
 
     ``descriptors`` (N, 128) uint8 RootSIFT, ``points`` (N, 2) float32 pixels, ``thumbnail`` (h, w) grey or (h, w, 3)
-    BGR uint8. ``id`` and ``session`` are the keyframe's.
+    BGR uint8. ``id`` and ``session`` are the keyframe's. ``scales`` (N,) float32 pixels and ``angles`` (N,) float32
+    radians are asked for by an index that compares them (``vocab.geometry``) and by no other.
     """
 
     id: int
@@ -20,6 +21,8 @@ class PlaceObservation:
     descriptors: NDArray[np.uint8]
     points: NDArray[np.float32]
     thumbnail: NDArray[np.uint8]
+    scales: NDArray[np.float32] | None = None
+    angles: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

@@ -120,5 +120,12 @@ def _elsewhere(one: Place, other: Place) -> bool:
 def _observe(keyframe: Keyframe) -> PlaceObservation:
     features = keyframe.features
     return PlaceObservation(
-        QUERY_ID, QUERY_ID, keyframe.stamp_ns, features.descriptors, features.points, keyframe.thumbnail
+        QUERY_ID,
+        QUERY_ID,
+        keyframe.stamp_ns,
+        features.descriptors,
+        features.points,
+        keyframe.thumbnail,
+        features.scales,
+        features.angles,
     )

@@ -87,6 +87,8 @@ def observe(keyframe: Keyframe) -> PlaceObservation:
         keyframe.features.descriptors,
         keyframe.features.points,
         keyframe.thumbnail,
+        keyframe.features.scales,
+        keyframe.features.angles,
     )
 
 

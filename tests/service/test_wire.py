@@ -103,6 +103,9 @@ def messages() -> list[Any]:
         Candidates(3, 5, ()),
         Forget(np.array([3, 1, 4], np.int64)),
         PlaceObservation(1, 0, 9, np.zeros((2, 128), np.uint8), np.zeros((2, 2), np.float32), grey),
+        PlaceObservation(
+            1, 0, 9, np.zeros((2, 128), np.uint8), np.zeros((2, 2), np.float32), grey, *np.ones((2, 2), np.float32)
+        ),
         loop(),
         loop(False),
         snapshot,

@@ -37,7 +37,10 @@ def observe(number: int, session: int = 0, n: int = 30) -> PlaceObservation:
     words = VOCABULARY.words[rng.integers(0, 80, n)].astype(int) + rng.integers(-3, 4, (n, 128))
     descriptors = np.clip(words, 0, 255).astype(np.uint8)
     thumbnail = rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)
-    return PlaceObservation(number, session, number * SECOND, descriptors, np.zeros((n, 2), np.float32), thumbnail)
+    scales, angles = np.exp(rng.uniform(0.5, 3, (1, n)))[0], rng.uniform(0, 6.28, n)
+    points = np.zeros((n, 2), np.float32)
+    given = scales.astype(np.float32), angles.astype(np.float32)
+    return PlaceObservation(number, session, number * SECOND, descriptors, points, thumbnail, *given)
 
 
 def filled(n: int = 40) -> PlaceIndex:
@@ -71,8 +74,9 @@ def test_what_is_saved_answers_the_same_and_goes_on_the_same(tmp_path: Path) -> 
     assert loaded.query(observe(1008, 1), 40) == index.query(observe(1008, 1), 40)
 
 
-def test_an_index_with_signatures_is_kept_with_them(path: Path, tmp_path: Path) -> None:
-    config = VocabConfig(signatures=True)
+@pytest.mark.parametrize("geometry", [False, True])
+def test_an_index_with_signatures_is_kept_with_them(path: Path, tmp_path: Path, *, geometry: bool) -> None:
+    config = VocabConfig(signatures=True, geometry=geometry)
     index = PlaceIndex(VOCABULARY, config)
     for number in range(40):
         index.add(observe(number, n=number % 35))
@@ -85,6 +89,8 @@ def test_an_index_with_signatures_is_kept_with_them(path: Path, tmp_path: Path) 
         PlaceIndex.load(tmp_path / "signed.places", VOCABULARY)
     with pytest.raises(IndexFileError, match="without signatures"):
         PlaceIndex.load(path, VOCABULARY, config)
+    with pytest.raises(IndexFileError, match="without geometry" if not geometry else "with geometry"):
+        PlaceIndex.load(tmp_path / "signed.places", VOCABULARY, VocabConfig(signatures=True, geometry=not geometry))
 
 
 def test_saving_a_loaded_index_writes_the_same_bytes(path: Path, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """The index of places in worlds of known words: revisits, exclusion of the recent past, ranking, errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -143,6 +145,42 @@ def test_signatures_tell_apart_what_one_word_lumps_together(vocabulary: Vocabula
         assert same == pytest.approx(other, abs=0.02) and same > 0.9
         near = signed.query(look(place, -1)).ranked
         assert near[0].id == place and 0.6 < near[0].votes <= 1 and near[1].votes < 0.15
+
+
+def test_geometry_tells_apart_places_whose_features_have_turned_differently(vocabulary: Vocabulary) -> None:
+    """Two places show the same features; those of the right one are all turned by 40 degrees and twice as large."""
+    rng = np.random.default_rng(9)
+    words = rng.integers(0, N_WORDS, 80)
+    picture = np.full((12, 16, 3), 90, np.uint8)
+    angles, scales = rng.uniform(0, 2 * np.pi, (2, 80)), np.exp(rng.uniform(1, 3, (2, 80)))
+
+    def look(key: int, place: int, turn: float = 0.0, growth: float = 1.0) -> PlaceObservation:
+        descriptors = vocabulary.words[words]
+        turned, grown = (angles[place] + turn) % (2 * np.pi), growth * scales[place]
+        given = grown.astype(np.float32), turned.astype(np.float32)
+        return PlaceObservation(key, key, 0, descriptors, np.zeros((80, 2), np.float32), picture, *given)
+
+    signed, whole = (PlaceIndex(vocabulary, VocabConfig(signatures=True, geometry=on)) for on in (False, True))
+    shards = [PlaceIndex(vocabulary, whole.config) for _ in range(2)]
+    for place in range(2):
+        for index in (signed, whole, shards[place]):
+            index.add(look(place, place))
+    for place in range(2):
+        query = look(-1, place, np.deg2rad(40), 2.0)
+        same, other = signed.query(query).ranked
+        assert same.votes == pytest.approx(other.votes, abs=1e-6) and same.votes > 0.9
+        first, second = whole.query(query).ranked
+        assert first.id == place and first.votes > 0.9 and second.votes < 0.5
+        merged = sorted((c for shard in shards for c in shard.query(query).ranked), key=lambda c: -c.score)
+        assert merged == [first, second]
+    plain = replace(look(5, 0), scales=None)
+    wrong = (plain, replace(look(5, 0), angles=np.full(80, np.nan, np.float32)), replace(look(5, 0), scales=scales[0]))
+    for bad in wrong:
+        with pytest.raises(ObservationError, match="float32 and finite"):
+            whole.add(bad)
+    assert len(whole) == 2 and signed.query(plain).ranked
+    with pytest.raises(ValidationError, match="signatures must be true"):
+        VocabConfig(geometry=True)
 
 
 def test_time_and_count_add_up(vocabulary: Vocabulary) -> None:
