@@ -96,6 +96,11 @@ class Bus(Protocol):
         """Return how many messages of each subscribed stream were missed, by the topic's name."""
         ...
 
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Return how many messages this node has refused for what was in them, by the topic's name."""
+        ...
+
     def send(self, topic: Topic, message: object) -> "Future[None]":
         """Send on an acked topic to every reader; waits while the window is full.
 
@@ -212,6 +217,11 @@ class LocalBus:
     @property
     def dropped(self) -> Mapping[str, int]:
         """Return nothing: here no message is missed."""
+        return {}
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Return nothing: here the sender has the error at once."""
         return {}
 
     def for_node(self, node: str) -> "LocalBus":

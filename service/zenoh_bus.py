@@ -13,7 +13,9 @@ import zenoh
 from seamark.service.bus import (
     DRAIN_TIMEOUT_S,
     BusClosedError,
+    ErrorCode,
     Handler,
+    RemoteError,
     UnavailableError,
     WrongKindError,
     check_kind,
@@ -59,6 +61,7 @@ class ZenohBus:
         self._pending: dict[Future[Any], str] = {}  # and who was asked
         self._closed = False
         self._dropped: dict[str, int] = {}
+        self._refused: dict[str, int] = {}
         # A query on its way to a node that is just being killed can be lost without an end before its timeout.
         self._watch = Watch(session, namespace, self._on_change)
 
@@ -71,6 +74,11 @@ class ZenohBus:
     def dropped(self) -> Mapping[str, int]:
         """Return how many messages of each subscribed stream were missed, by the topic's name."""
         return dict(self._dropped)
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Return how many messages this node has refused for what was in them, by the topic's name."""
+        return dict(self._refused)
 
     @property
     def resent(self) -> int:
@@ -138,10 +146,10 @@ class ZenohBus:
         acked = topic.kind is Kind.ACKED
         process: Callable[[Any], None]
         if acked:
-            reader = Reader(topic.name, lambda payload: callback(decode(payload, topic.message)))
+            reader = Reader(topic.name, lambda payload: callback(decode(payload, topic.message)), self._count_refused)
             process, limit = reader.process, WINDOWS_WAITING * topic.depth
         else:
-            process, limit = server(topic, callback), topic.depth + max(1, workers)
+            process, limit = server(topic, callback, self._count_refused), topic.depth + max(1, workers)
         with self._lock:
             self._check_open()
             submit = self._pool(topic, workers) if workers and not acked else self._ordered_worker().submit
@@ -217,6 +225,15 @@ class ZenohBus:
         for future, asked in list(self._pending.items()):
             if asked == node and not came:
                 settle(future, UnavailableError(f"the {node} node died while it worked"))
+
+    def _count_refused(self, topic: str, error: RemoteError) -> None:
+        """Count what was refused, and say so: once for each doubling, so that a flood does not fill the log."""
+        if error.code in (ErrorCode.BUSY, ErrorCode.GAP):  # nothing is wrong with the message
+            return
+        with self._lock:
+            count = self._refused[topic] = self._refused.get(topic, 0) + 1
+        if count & (count - 1) == 0:
+            logger.warning("message %d that was refused on topic %s: %s", count, topic, error)
 
     def _check_open(self) -> None:
         if self._closed:

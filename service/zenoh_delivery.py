@@ -261,11 +261,17 @@ class Outbox:
 class Reader:
     """Receives one acked topic, in the order of each sender; ``handle`` takes a payload and may return a Future.
 
-    All calls come from one thread, the node's ordered worker.
+    ``refused`` is told of errors. All calls come from one thread, the node's ordered worker.
     """
 
-    def __init__(self, name: str, handle: Callable[[bytes], "Future[None] | None"]) -> None:
+    def __init__(
+        self,
+        name: str,
+        handle: Callable[[bytes], "Future[None] | None"],
+        refused: Callable[[str, RemoteError], None],
+    ) -> None:
         self._name = name
+        self._refused = refused
         self._handle = handle
         self._expected: dict[bytes, int] = {}
         self._pending: dict[tuple[bytes, int], Future[None]] = {}
@@ -275,6 +281,7 @@ class Reader:
         try:
             sender, number, base = unpack_stamp(query.attachment)
         except WireError as error:
+            self._refused(self._name, error_reply(error))
             refuse(query, error_reply(error))
             return
         expected = max(self._expected.get(sender, base), base)
@@ -291,6 +298,7 @@ class Reader:
                 return
             except Exception as error:
                 refusal_of = error_reply(error)
+                self._refused(self._name, refusal_of)
                 if refusal_of.code == ErrorCode.BUSY:  # not now: the sender keeps it and sends it again
                     self._advance(sender, number)
                 refuse(query, refusal_of)

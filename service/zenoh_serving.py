@@ -109,8 +109,8 @@ def bounded(
     return on_query
 
 
-def server(topic: Topic, callback: Handler) -> Callable[[Any], None]:
-    """Return what answers one query of a request topic."""
+def server(topic: Topic, callback: Handler, refused: Callable[[str, RemoteError], None]) -> Callable[[Any], None]:
+    """Return what answers one query of a request topic and tells ``refused`` of errors."""
 
     def process(query: Any) -> None:
         try:
@@ -118,7 +118,9 @@ def server(topic: Topic, callback: Handler) -> Callable[[Any], None]:
         except BusClosedError:
             return
         except Exception as error:
-            refuse(query, error_reply(error))
+            refusal_of = error_reply(error)
+            refused(topic.name, refusal_of)
+            refuse(query, refusal_of)
             return
         assert topic.reply is not None
         answer(query, reply, encoding_of(topic.reply))

@@ -16,7 +16,7 @@ from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places_cache import PlacesCache, cache_path, observe, open_index
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.requests import Done, Forget
+from seamark.service.requests import Done, Forget, Status
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import Candidates, PlaceObservation
 from seamark.vocab.vocabulary import Vocabulary
@@ -54,8 +54,8 @@ class VocabNode:
         if len(index):
             self._count_places()
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
-        bus.handle(topics.STATUS[bus.node], lambda _: self._meter.status(), workers=1)
-        bus.handle(topics.PROGRESS[bus.node], lambda _: self._meter.status())
+        bus.handle(topics.STATUS[bus.node], self._on_status, workers=1)
+        bus.handle(topics.PROGRESS[bus.node], self._on_status)
         bus.handle(topics.PLACES_RANK, self._on_rank, workers=1)
         bus.handle(topics.FORGET, self._on_forget)
         bus.handle(topics.KEYFRAME, self._on_keyframe)
@@ -102,6 +102,11 @@ class VocabNode:
     def _on_rank(self, observation: PlaceObservation) -> Candidates:
         with self._lock, self._meter.timed("rank_query"):
             return self._index.query(observation)
+
+    def _on_status(self, _: object) -> Status:
+        for topic, count in self._bus.refused.items():
+            self._meter.keep(f"{topic}_refused", count)
+        return self._meter.status()
 
     def _on_drain(self, _: object) -> Done:
         self._bus.drain()
