@@ -1,14 +1,14 @@
 """What each ingredient of place recognition is worth: recall, and recall without an error.
 
-    .venv/bin/python benchmarks/places.py DATABASE QUERIES [--tolerance 3] [--signatures] [--every 1]
-    .venv/bin/python benchmarks/places.py SOURCE [--signatures] [--every 1]
+    .venv/bin/python benchmarks/places.py DATABASE QUERIES [--tolerance 3] [--every 1]
+    .venv/bin/python benchmarks/places.py SOURCE [--every 1]
 
 Sources are those of ``seamark places eval``, and so is the truth: poses where both have them, else the number of the
 image. A single source is asked for its own past, with the front end's odometry in rows of their own. Only every
 ``--every``-th image is used. Images are taken singly, but for rows in order. Columns: recall@1, @5, @10, @20, recall
 at full precision, and CPU time without looking for features, with what it takes to fill the index shared out. Then
 the probability of the default against how many answers were right.
-``--signatures`` adds Hamming embedding and weak geometric consistency, with directions learned from generated images.
+Signatures are Hamming embedding, geometry weak geometric consistency, islands neighbouring places taken together.
 """
 
 import argparse
@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.datasets_synth.imagery import training_images
 from seamark.frontend.config import FrontendConfig
 from seamark.service import places_metrics
 from seamark.service.places_eval import EvalOptions, same_places
@@ -31,9 +30,7 @@ from seamark.service.places_motion import Motion, follow
 from seamark.service.places_search import Answer, search, search_own
 from seamark.service.sources.base import Source
 from seamark.service.sources.open import open_sources
-from seamark.vocab import signatures
 from seamark.vocab.config import VocabConfig
-from seamark.vocab.inverted_index import InvertedIndex
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.vocabulary import Vocabulary
 
@@ -43,9 +40,13 @@ CUES = {
     "view": {"votes_weight": 0.0, "histogram_weight": 0.0, "view_weight": 1.0},
     "votes, 2 nearest words": {"histogram_weight": 0.0, "view_weight": 0.0, "soft_words": 2},
     "votes, 3 nearest words": {"histogram_weight": 0.0, "view_weight": 0.0, "soft_words": 3},
+    "votes, signatures": {"histogram_weight": 0.0, "view_weight": 0.0, "signatures": True},
+    "votes, signatures, geometry": {"histogram_weight": 0.0, "view_weight": 0.0, "signatures": True, "geometry": True},
     "votes + histograms": {"view_weight": 0.0},
     "votes + view": {"histogram_weight": 0.0},
     "votes + histograms + view (default)": {},
+    "default, signatures": {"signatures": True},
+    "default, signatures, geometry": {"signatures": True, "geometry": True},
 }
 Scores = NDArray[np.float64]
 Images = Sequence[DescribedImage]
@@ -62,35 +63,10 @@ def by_cues(database: Images, queries: Images, vocabulary: Vocabulary, weights: 
     return scores
 
 
-def by_signatures(database: Images, queries: Images, vocabulary: Vocabulary, *, with_geometry: bool) -> Scores:
-    """The strongest features only, which are those whose scale and orientation are kept."""
-    config = FrontendConfig()
-    learned = np.concatenate([describe_features(image, config) for image in training_images(99, 60)])
-    projection = signatures.learn_projection(learned, vocabulary.words, vocabulary.assign(learned))
-    index = InvertedIndex(vocabulary.idf, with_signatures=True, with_geometry=with_geometry)
-
-    def parts(image: DescribedImage) -> tuple[NDArray[np.int32], NDArray[np.uint64], NDArray[np.uint16] | None]:
-        found = image.features
-        words = vocabulary.assign(found.descriptors)
-        signed = signatures.sign(found.descriptors, vocabulary.words, words, projection)
-        return words, signed, signatures.geometry(found.angles, found.scales) if with_geometry else None
-
-    for image in database:
-        index.add(*parts(image))
-    table = signatures.vote_table()
-    rows = []
-    for query in queries:
-        words, signed, geometry = parts(query)
-        rows.append(index.near_votes(words, signed, table, geometry))
-    return np.stack(rows).astype(np.float64)
-
-
-def describe_features(image: NDArray[np.uint8], config: FrontendConfig) -> NDArray[np.uint8]:
-    from seamark.frontend.features import extract_features
-
-    return extract_features(
-        image, config.sift_features, config.sift_contrast, max_pixels=config.sift_pixels
-    ).descriptors
+def by_islands(scores: Scores) -> Scores:
+    """Return scores in which each place counts by half with the mean of itself and both neighbours in the database."""
+    padded = np.pad(scores, ((0, 0), (1, 1)), mode="edge")
+    return (scores + (padded[:, :-2] + scores + padded[:, 2:]) / 3) / 2
 
 
 def report(name: str, ranked: Sequence[Sequence[int]], best: Scores, truth: NDArray[np.bool_], ms: float) -> None:
@@ -124,7 +100,6 @@ def main() -> None:
     parser.add_argument("--tolerance", type=int, default=3)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--vocab", type=Path)
-    parser.add_argument("--signatures", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     vocabulary = Vocabulary.load(options.vocab) if options.vocab else Vocabulary.default()
@@ -166,26 +141,34 @@ def main() -> None:
 
     for name, weights in CUES.items():
         matrix(name, lambda weights=weights: by_cues(database, queries, vocabulary, weights))
-    for geometry in (False, True) if options.signatures else ():
-        name = "votes with signatures" + (", orientation and scale" if geometry else "")
-        matrix(name, lambda g=geometry: by_signatures(database, queries, vocabulary, with_geometry=g))
-    for by, in_order in product((None, motion) if motion else (None,), (False, True)):
+    for name in ("votes", "votes + histograms + view (default)"):
+        weights = CUES[name]
+        matrix(f"{name}, islands", lambda weights=weights: by_islands(by_cues(database, queries, vocabulary, weights)))
+    for by, in_order, alone in product((None, motion) if motion else (None,), (False, True), (True, False)):
+        if own and alone:
+            continue
         start = time.process_time()
         arguments = {"top": 20, "in_order": in_order, "workers": 1}
         if own:
             answers, _ = search_own(database, stamps, vocabulary, settings, **arguments, motion=by)
         else:
-            answers = search(database, queries, vocabulary, VocabConfig(), **arguments)
+            answers = search(database, queries, vocabulary, VocabConfig(), **arguments, alone=alone)
         ms = 1e3 * (time.process_time() - start) / len(queries)
         answers = [answers[row] for row in rows]
         places = [[match.place for match in answer.matches] for answer in answers]
-        name = ("in order" if in_order else "verification of 20") + (", odometry" if by else "")
+        name = (
+            ("in order" if in_order else "verification of 20")
+            + (", odometry" if by else "")
+            + (", alone" if alone else "")
+        )
         if not in_order and not by:
             report(name, places, np.array([answer.evidence for answer in answers]), truth[rows], ms)
             name += ", less doubt (places match)"
         report(name, places, np.array([answer.matches[0].score for answer in answers]), truth[rows], ms)
-        if not in_order and by is motion:
+        if not in_order and by is motion and not alone:
             singly = answers
+        right = [truth[row, a.matches[0].place] for row, a in zip(rows, answers, strict=True) if a.matches[0].accepted]
+        print(f"| accepted | {sum(right)} right, {len(right) - sum(right)} wrong |")
     reliability(singly, truth[rows])
 
 
