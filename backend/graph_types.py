@@ -133,6 +133,28 @@ def check_node(node: Node) -> None:
     _check_covariance(f"keyframe {node.id}", node.covariance)
 
 
+def check_nodes(nodes: Sequence[Node]) -> None:
+    """Do what ``check_node`` does for many nodes at once; of those that are malformed the first is named."""
+    if nodes and not _all_sound(nodes):
+        for node in nodes:
+            check_node(node)
+
+
+def _all_sound(nodes: Sequence[Node]) -> bool:
+    try:
+        T = np.stack([node.T_odom_cam for node in nodes])
+        covariances = np.stack([node.covariance for node in nodes])
+    except ValueError:  # shapes that differ
+        return False
+    if T.shape[1:] != (4, 4) or covariances.shape[1:] != (6, 6):
+        return False
+    if not (np.isfinite(T).all() and np.isfinite(covariances).all()):
+        return False
+    R = T[:, :3, :3]
+    rigid = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() <= 1e-3 and (np.linalg.det(R) >= 0).all()
+    return bool(rigid and (np.diagonal(covariances, axis1=1, axis2=2) >= 0).all())
+
+
 def check_constraint(constraint: Constraint) -> None:
     """Raise BackendInputError unless the loop's numbers are finite, its pose rigid and its scale positive."""
     name = constraint.name

@@ -36,6 +36,8 @@ class KeyframeMemory:
 
     def add(self, keyframe: Keyframe) -> Keyframe:
         """Keep a keyframe's features; return the keyframe without them, without image and thumbnail."""
+        if not len(keyframe.features) and not keyframe.jpeg and not keyframe.thumbnail.size:
+            return keyframe  # as a map gives those that were there before
         if len(keyframe.features):
             self._keep(replace(keyframe, jpeg=b"", thumbnail=NO_THUMBNAIL))
         return replace(keyframe, features=Features.empty(), landmarks=NO_LANDMARKS, jpeg=b"", thumbnail=NO_THUMBNAIL)

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from seamark.backend.consistency import gate_chi2
 from seamark.backend.contraction import contract
 from seamark.backend.errors import BackendInputError
 from seamark.backend.evidence import Evidence, Gate
-from seamark.backend.graph_types import Constraint, Estimate, Node, Solver, Span, check_node
+from seamark.backend.graph_types import Constraint, Estimate, Node, Solver, Span, check_nodes
 from seamark.backend.judge import PoseJudge
 from seamark.backend.judge_places import PlaceJudge
 from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
@@ -144,9 +144,8 @@ class Slam:
         With ``poses``, those of the map at ``revision``, nothing is solved; without, all is. ``spans`` and ``means``
         are what the map has of keyframes that have gone. ``held``: these poses are never changed.
         """
-        poses, spans = poses or {}, spans or {}
         self._means = dict(means or {})
-        nodes = [self._hold(keyframe, poses.get(keyframe.id), spans.get(keyframe.id)) for keyframe in keyframes]
+        nodes = self._hold(list(keyframes), poses, spans)
         accepted: dict[Key, Constraint | None] = {}
         for loop in loops:
             with self._lock:
@@ -159,15 +158,14 @@ class Slam:
         if poses and self._solver is not None:
             self._map.revision = revision
             constraints = [constraint for constraint in accepted.values() if constraint is not None]
-            known = [node for node in nodes if node is not None]
-            self._solver.restore(known, constraints, self._map.estimate(), held=held)
+            self._solver.restore(nodes, constraints, self._map.estimate(), held=held)
             self._committed |= set(accepted)
             self._unsolved = (
                 bool(accepted) and not held
             )  # loops may have come after the last solution: the next keyframe asks
             return
         for node in nodes:
-            if self._solver is not None and node is not None:
+            if self._solver is not None:
                 self._solver.add_keyframe(node)
         if self._commit(list(accepted)) and self._solver is not None:
             self._take(self._solver.optimise())
@@ -228,33 +226,30 @@ class Slam:
 
     def _add(self, keyframe: Keyframe) -> None:
         """Take the keyframe into memory and, but in mode places, into the graph."""
-        node = self._hold(keyframe)
-        if self._solver is not None and node is not None:
+        for node in self._hold([keyframe]):
+            assert self._solver is not None
             self._solver.add_keyframe(node)
 
-    def _hold(self, keyframe: Keyframe, pose: StoredPose | None = None, span: Span | None = None) -> Node | None:
-        """Take the keyframe into memory; return what the graph is to know of it."""
-        node = None
-        if keyframe.id in self._map.keyframes:
-            raise BackendInputError(f"keyframe {keyframe.id} was given twice")
+    def _hold(
+        self,
+        keyframes: Sequence[Keyframe],
+        poses: Mapping[int, StoredPose] | None = None,
+        spans: Mapping[int, Span] | None = None,
+    ) -> list[Node]:
+        """Take keyframes into memory, all or none; return what the graph is to know of them, in mode places nothing."""
+        twice = [one.id for one in keyframes if one.id in self._map.keyframes]
+        if twice:
+            raise BackendInputError(f"keyframe {twice[0]} was given twice")
+        nodes: list[Node] = []
         if self._solver is not None:
-            if keyframe.T_odom_cam is None:
-                raise BackendInputError(f"keyframe {keyframe.id} ({keyframe.file}) has no odometry pose")
-            covariance = np.zeros((6, 6)) if keyframe.covariance is None else keyframe.covariance
-            node = Node(
-                keyframe.id,
-                keyframe.session,
-                keyframe.previous_id,
-                keyframe.T_odom_cam,
-                covariance,
-                keyframe.metric,
-                span,
-            )
-            check_node(node)
-            self._chains.add(node)
+            nodes = [_node_of(one, None if spans is None else spans.get(one.id)) for one in keyframes]
+            check_nodes(nodes)
+            if nodes:
+                self._chains.extend(nodes)
         with self._lock:
-            self._map.add(self._memory.add(keyframe), pose)
-        return node
+            for one in keyframes:
+                self._map.add(self._memory.add(one), None if poses is None else poses.get(one.id))
+        return nodes
 
     def _verify(self, keyframe: Keyframe, candidates: Candidates) -> list[tuple[Candidate, Verification | Rejected]]:
         """Compare the keyframe with the best candidate of each island."""
@@ -410,3 +405,12 @@ class Slam:
             view=candidate.view,
             probability=likely,
         )
+
+
+def _node_of(keyframe: Keyframe, span: Span | None) -> Node:
+    """Return what the graph knows of a keyframe; raises BackendInputError for one without odometry."""
+    if keyframe.T_odom_cam is None:
+        raise BackendInputError(f"keyframe {keyframe.id} ({keyframe.file}) has no odometry pose")
+    covariance = np.zeros((6, 6)) if keyframe.covariance is None else keyframe.covariance
+    own = (keyframe.id, keyframe.session, keyframe.previous_id)
+    return Node(*own, keyframe.T_odom_cam, covariance, keyframe.metric, span)

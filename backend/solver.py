@@ -17,7 +17,16 @@ from typing import Any, cast
 from seamark import SeamarkError
 from seamark.backend.config import BackendConfig
 from seamark.backend.errors import BackendInputError, SolverError
-from seamark.backend.graph_types import Constraint, Estimate, Key, Matrix, Node, check_constraint, check_node
+from seamark.backend.graph_types import (
+    Constraint,
+    Estimate,
+    Key,
+    Matrix,
+    Node,
+    check_constraint,
+    check_node,
+    check_nodes,
+)
 
 Tells = list[tuple[str, tuple[Any, ...]]]
 
@@ -68,8 +77,7 @@ class SolverProcess:
         self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
     ) -> None:
         """Take in a graph that was solved before, ``held`` or not; the child hears of it when it is first needed."""
-        for node in nodes:
-            check_node(node)
+        check_nodes(nodes)
         self._keyframes |= {node.id for node in nodes}
         self._loops |= {constraint.key for constraint in constraints}
         self._told.append(("restore", (nodes, constraints, estimate, held)))
