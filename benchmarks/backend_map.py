@@ -3,6 +3,7 @@
     .venv/bin/python benchmarks/backend_map.py commit --keyframes 500
     .venv/bin/python benchmarks/backend_map.py recover --keyframes 10000
     .venv/bin/python benchmarks/backend_map.py service --keyframes 10000
+    .venv/bin/python benchmarks/backend_map.py prune --keyframes 20000
     .venv/bin/python benchmarks/backend_map.py laps --laps 50
 
 Keyframes are synthetic: descriptors of the length and density of RootSIFT, 800 a picture, a JPEG of 60 kB of noise. Of
@@ -16,6 +17,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,10 +29,11 @@ import psutil
 from seamark import SeamarkError
 from seamark.backend.config import BackendConfig, MapConfig, VerificationConfig
 from seamark.backend.map_open import loader, restore
+from seamark.backend.map_prune import choose, views_of
 from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam
 from seamark.backend.solver import SolverProcess
-from seamark.backend.types import MapSnapshot
+from seamark.backend.types import Loop, MapSnapshot, Reason
 from seamark.datasets_synth.toy import ToyWorld, toy_sequence
 from seamark.frontend.camera import Camera
 from seamark.frontend.types import Features, Frame, Keyframe, Mode
@@ -38,7 +41,7 @@ from seamark.service import topics
 from seamark.service.config import load_config
 from seamark.service.launcher import Launcher
 from seamark.service.nodes.map_keeper import MapKeeper
-from seamark.service.nodes.map_pruner import MapPruner
+from seamark.service.nodes.map_pruner import AT_ONCE, MapPruner
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty, PlaceQuery
@@ -205,6 +208,39 @@ def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, An
     return rows
 
 
+def prune(folder: Path, count: int) -> dict[str, object]:
+    """Return how long each part of forgetting 500 keyframes takes in a map of ten laps with loops between them."""
+    path, per_lap = folder / "map.seamark", count // 10
+    template = keyframe(0, per_lap, 0, 8)
+    ids, T = np.arange(count), np.stack([pose(number, per_lap) for number in range(count)])
+    again = range(per_lap, count, 10)
+    tight = 1e-4 * np.eye(6)
+    loops = [Loop(n, n - per_lap, True, Reason.ACCEPTED, 50, 0.5, 0.5, 0.1, np.eye(4), tight) for n in again]
+    config, taken = BackendConfig(map=MapConfig(keyframes=count - 1)), {}
+
+    def timed(name: str, work: Callable[[], Any]) -> Any:
+        started = time.process_time()
+        result = work()
+        taken[name] = round(1e3 * (time.process_time() - started))
+        return result
+
+    with MapStore(path) as store:
+        store.file.database.execute("PRAGMA synchronous = OFF")  # only while the map is made
+        for number in range(count):
+            previous = number - 1 if number else None
+            store.add_keyframe(replace(template, id=number, previous_id=previous, T_odom_cam=T[number]))
+        store.record(loops, MapSnapshot(1, ids, ids * 0, ids * 0, T, np.ones(count), ()), {"mapped": str(count - 1)})
+        store.file.database.execute("PRAGMA synchronous = FULL")
+        slam = Slam(config, Mode.RGBD, SolverProcess(config), 0, loader(store))
+        restore(slam, store)
+        views = timed("views", lambda: views_of(store))
+        pruning = timed("choose", lambda: choose(views, int(0.9 * count), (), config.map, (), AT_ONCE))
+        change = timed("contract", lambda: slam.without(pruning.forget))
+        timed("write", lambda: store.contract(change))
+        timed("adopt", lambda: slam.adopt(change))
+    return {"keyframes": count, "loops": len(loops), "forgotten": len(pruning.forget), "cpu_ms": taken}
+
+
 def service(folder: Path, count: int) -> dict[str, object]:
     """Kill all three processes of a service with a large map; return how long it takes until a place is right again.
 
@@ -301,7 +337,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("commit", "recover", "service", "laps"))
+    parser.add_argument("what", choices=("commit", "recover", "prune", "service", "laps"))
     parser.add_argument("--keyframes", type=int, default=500)
     parser.add_argument("--laps", type=int, default=50)
     parser.add_argument("--per-lap", type=int, default=25)
@@ -314,6 +350,8 @@ def main() -> None:
             print(json.dumps(commit(Path(folder), options.keyframes)))
         elif options.what == "recover":
             print(json.dumps(recover(Path(folder), options.keyframes)))
+        elif options.what == "prune":
+            print(json.dumps(prune(Path(folder), options.keyframes)))
         elif options.what == "service":
             print(json.dumps(service(Path(folder), options.keyframes)))
         else:

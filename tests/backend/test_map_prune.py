@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from seamark.backend import map_prune, map_relations
 from seamark.backend.config import MapConfig
 from seamark.backend.map_codec import lighting_of
 from seamark.backend.map_prune import View, choose
@@ -26,8 +27,10 @@ def stands(one: View, other: View) -> bool:
     return bool(near and along and np.abs(one.lighting - other.lighting).max() < 0.12)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_every_view_that_goes_has_one_that_stays(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "compared"), [(0, 2000), (1, 2000), (2, 30), (3, 30), (4, 1)])
+def test_every_view_that_goes_has_one_that_stays(seed: int, compared: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test: all views compared at once, or a few places after the other. Expected: what stays stands for what went."""
+    monkeypatch.setattr(map_prune, "COMPARED", compared)
     rng = np.random.default_rng(seed)
     views = [
         view(n, float(rng.uniform(0, 20)), float(rng.choice([0, 15, 90, 180])), DAY if rng.random() < 0.7 else NIGHT)
@@ -41,6 +44,32 @@ def test_every_view_that_goes_has_one_that_stays(seed: int) -> None:
     # Twenty metres, four ways of looking of which two are alike, two lightings: not many are needed.
     assert 2 * 3 * 10 <= len(kept) <= 2 * 3 * 20 + 40
     assert choose(views, 1, (), CONFIG).forget == pruning.forget
+
+
+@pytest.mark.parametrize("at_once", [1, 700, 10**6])
+def test_relations_are_those_of_each_pair(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_relations, "PAIRS_AT_ONCE", at_once)
+    rng = np.random.default_rng(7)
+    lights, ways = (DAY, DAY + 0.11, NIGHT), (0, 19, 21, 90)
+    views = [
+        view(n, float(x), float(rng.choice(ways)), lights[rng.integers(3)], int(rng.integers(2)))
+        for n, x in enumerate(rng.uniform(-4, 4, 150))
+    ]
+    relations = map_relations.Relations(views, (), CONFIG)
+    kept = rng.random(len(views)) < 0.7
+    for rows in relations.blocks(40):
+        relations.compare(rows, kept)
+    assert sorted(relations.near) == list(range(len(views)))
+    for row, one in enumerate(views):
+        expected = [k for k, other in enumerate(views) if k != row and stands(one, other)]
+        assert relations.near[row].tolist() == expected
+        assert relations.stands_for[row] == sum(kept[k] for k in expected)
+
+
+def test_at_most_so_many_go_at_once_and_none_that_is_spared() -> None:
+    views = [view(n, 0.001 * n) for n in range(50)]
+    pruning = choose(views, 10, (), CONFIG, spared=range(5), most=12)
+    assert pruning.forget == tuple(range(5, 17)) and pruning.kept == 38
 
 
 def test_a_budget_is_met_exactly_where_places_allow_it_and_the_oldest_go_first() -> None:
