@@ -124,8 +124,8 @@ class Frontend:
         if self._initialiser is not None:
             return self._initialise(session, self._initialiser, frame, image, tracks)
 
-        prediction = session.prediction()
-        pose, keep = tracker.estimate(session, self._sensor, frame, tracks, prediction)
+        readings, prediction = tracker.readings(self._sensor, frame, tracks), session.prediction()
+        pose, keep = tracker.estimate(session, tracks, readings, prediction)
         watch.lap("pose")
         if pose is None or tracker.abrupt(session, pose):
             recovered = self._recover(session, frame, image, pose)
@@ -134,7 +134,7 @@ class Frontend:
         if pose is None:
             return self._lose(session, frame, image)
         settled = tracker.settle(session, image, tracks, pose.T_odom_cam)
-        better, keep_better = tracker.estimate(session, self._sensor, frame, settled, prediction, pose)
+        better, keep_better = tracker.estimate(session, settled, readings, prediction, pose)
         if better is not None:
             pose, keep, tracks = better, keep_better, settled
         watch.lap("settle")

@@ -94,14 +94,11 @@ class Session:
         self, tracks: Tracks, inverse_depth: NDArray[np.float64], inverse_sigma: NDArray[np.float64]
     ) -> tuple[Observations, NDArray[np.bool_]]:
         """Return what tracks with a landmark say about the pose, and which tracks those are."""
-        positions = self.landmarks.get(tracks.ids)
-        known = np.isfinite(positions[:, 0])
-        pixels = self.camera.undistort(tracks.pixels)
-        inverse_depth = self.depth_offset.correct(inverse_depth)
-        spread = self.landmarks.spread(tracks.ids[known])
+        known, positions, spread = self.landmarks.known(tracks.ids)
+        pixels = self.camera.undistort(tracks.pixels[known])
+        inverse_depth = self.depth_offset.correct(inverse_depth[known])
         origin = self.reference.T_odom_cam[:3, 3]
-        measured = inverse_depth[known], inverse_sigma[known]
-        return Observations(positions[known], pixels[known], *measured, spread, origin), known
+        return Observations(positions, pixels, inverse_depth, inverse_sigma[known], spread, origin), known
 
     def gate_px(self) -> float:
         """Return how far a landmark may be seen from where it should be, by the noise of late: what moves slowly or
@@ -120,9 +117,8 @@ class Session:
 
     def distance(self) -> float:
         """Return the median distance of what is tracked, 1 where none is known."""
-        away = self.landmarks.get(self.tracks.ids) - self.T_odom_cam[:3, 3]
+        away = self.landmarks.known(self.tracks.ids)[1] - self.T_odom_cam[:3, 3]
         squared = np.einsum("ij,ij->i", away, away)
-        squared = squared[np.isfinite(squared)]
         middle = len(squared) // 2
         return float(np.sqrt(np.partition(squared, middle)[middle])) if len(squared) else 1.0
 

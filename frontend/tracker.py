@@ -80,25 +80,31 @@ def follow(session: Session, before: Pyramid, after: Pyramid, *, predict: bool) 
     return Tracks(tracks.ids[ok], there[ok]), tracks.pixels[ok]
 
 
+def readings(sensor: DepthSensor, frame: Frame, tracks: Tracks) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what the sensor says of the inverse depth of tracks (N,) at every frame, and its sigma; NaN for nothing.
+
+    Depth images are read for next to nothing. A stereo match costs as much as the tracking and waits for keyframes.
+    """
+    if isinstance(sensor, DepthImage):
+        return sensor.inverse_depth(frame, tracks.pixels)
+    unknown = np.full(len(tracks), np.nan)
+    return unknown, unknown
+
+
 def estimate(
     session: Session,
-    sensor: DepthSensor,
-    frame: Frame,
     tracks: Tracks,
+    readings: tuple[NDArray[np.float64], NDArray[np.float64]],
     prediction: Prediction,
     start: PoseEstimate | None = None,
 ) -> tuple[PoseEstimate | None, NDArray[np.bool_]]:
     """Estimate the pose from the tracks with a landmark; returns it and which tracks (N,) it does not refute.
 
-    ``prediction`` says where the camera is expected, ``start`` is the pose of the same tracks before their pixels were
-    settled.
+    ``readings`` are the inverse depths of the tracks and their sigmas. ``prediction`` says where the camera is expected,
+    ``start`` the pose of the same tracks before their pixels were settled.
     """
     c = session.config
-    unknown = np.full(len(tracks), np.nan)
-    # Depth images are read for free at every frame; a stereo match costs as much as the tracking and waits for
-    # keyframes.
-    reading = sensor.inverse_depth(frame, tracks.pixels) if isinstance(sensor, DepthImage) else (unknown, unknown)
-    observations, known = session.observations(tracks, *reading)
+    observations, known = session.observations(tracks, *readings)
     votes = static_votes(tracks.pixels[known], session.ages.of(tracks.ids[known]), session.camera)
     pose = None
     for threshold_px in dict.fromkeys((session.gate_px(), c.pnp_threshold_px)):  # once where they are the same
@@ -131,10 +137,9 @@ def settle(session: Session, image: Pyramid, tracks: Tracks, T_odom_cam: NDArray
     """Align tracks once more with their patches in the newest keyframe, warped as the pose says; undoes their drift."""
     reference, camera = session.reference, session.camera
     mine, theirs = shared(tracks.ids, reference.track_ids)
-    positions = session.landmarks.get(tracks.ids[mine])
-    known = np.isfinite(positions[:, 0])
+    known, positions, _ = session.landmarks.known(tracks.ids[mine])
     mine, theirs = mine[known], theirs[known]
-    in_reference = se3.transform(se3.inverse(reference.T_odom_cam), positions[known])
+    in_reference = se3.transform(se3.inverse(reference.T_odom_cam), positions)
     warps = patch_warps(se3.inverse(T_odom_cam) @ reference.T_odom_cam, in_reference, camera)
     with np.errstate(invalid="ignore", divide="ignore"):
         sound = np.abs(np.log(np.linalg.det(warps))) < MAX_LOG_SCALE

@@ -121,6 +121,12 @@ class LandmarkTable:
         out[held] = self._positions[index[held]]
         return out
 
+    def known(self, track_ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+        """Return which of the ids (N,) have a position, and of those the positions (K, 3) and spreads (K,)."""
+        index, held = self._find(track_ids)
+        held[held] = np.isfinite(self._positions[index[held], 0])
+        return held, self._positions[index[held]], self._spreads[index[held]]
+
     def spread(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the spreads (N,); forgotten and new ids are NaN."""
         out = np.full(len(track_ids), np.nan)
