@@ -100,8 +100,8 @@ def estimate(
 ) -> tuple[PoseEstimate | None, NDArray[np.bool_]]:
     """Estimate the pose from the tracks with a landmark; returns it and which tracks (N,) it does not refute.
 
-    ``readings`` are the inverse depths of the tracks and their sigmas. ``prediction`` says where the camera is expected,
-    ``start`` the pose of the same tracks before their pixels were settled.
+    ``readings`` are the inverse depths of the tracks and their sigmas, ``prediction`` is where the camera is expected,
+    and ``start`` the pose of the same tracks before their pixels were settled.
     """
     c = session.config
     observations, known = session.observations(tracks, *readings)
