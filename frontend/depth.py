@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.frontend import flow, se3
+from seamark.frontend.camera import CalibrationError
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.features import grey_of
 from seamark.frontend.patches import align_along
@@ -97,8 +98,14 @@ class StereoPair:
     """Stereo: Lucas-Kanade from the left to the right image with a left-right check and the epipolar constraint."""
 
     def __init__(self, rig: Rig, config: FrontendConfig) -> None:
-        assert rig.cam1 is not None and rig.T_cam0_cam1 is not None
-        self._left, self._right = rig.cam0, rig.cam1
+        if rig.cam1 is None or rig.T_cam0_cam1 is None:
+            raise CalibrationError("mode stereo needs a calibration of both cameras")
+        self._left, self._right = left, right = rig.cam0, rig.cam1
+        if (left.width, left.height) != (right.width, right.height):
+            raise CalibrationError(
+                "mode stereo needs images of one size, "
+                f"not {left.width} x {left.height} and {right.width} x {right.height}"
+            )
         self._T_right_left = se3.inverse(rig.T_cam0_cam1)
         self._config = config
         self._baseline_m = float(np.linalg.norm(rig.T_cam0_cam1[:3, 3]))
@@ -183,7 +190,7 @@ class StereoPair:
 
 
 def make_depth_sensor(rig: Rig, mode: Mode, config: FrontendConfig) -> DepthSensor:
-    """Return the depth sensor of a mode."""
+    """Return the depth sensor of a mode; raises CalibrationError where the rig is not one for it."""
     if mode is Mode.RGBD:
         return DepthImage(rig, config)
     if mode is Mode.STEREO:

@@ -23,6 +23,7 @@ from seamark.frontend.pose import PoseEstimate
 from seamark.frontend.pyramid import Pyramid, pyramid_of
 from seamark.frontend.recovery import recover
 from seamark.frontend.session import Session
+from seamark.frontend.stopwatch import Stopwatch
 from seamark.frontend.tracks import Tracks
 from seamark.frontend.types import Frame, Keyframe, Mode, Odometry, Outcome, Quality, Rig
 
@@ -33,20 +34,6 @@ class FrontendResult:
 
     odometry: Odometry
     keyframes: tuple[Keyframe, ...]
-
-
-class Stopwatch:
-    """Collects the milliseconds of named stages; times are reported, never decided upon."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock, self._last = clock, clock()
-        self.stages_ms: dict[str, float] = {}
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap."""
-        now = self._clock()
-        self.stages_ms[stage] = self.stages_ms.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
 
 
 class Frontend:
@@ -63,8 +50,6 @@ class Frontend:
     ) -> None:
         if mode is not Mode.PLACES and rig is None:
             raise CalibrationError(f"mode {mode} needs a calibration")
-        if mode is Mode.STEREO:
-            _check_pair(rig)
         self._rig, self._mode, self._config, self._clock = rig, mode, config, clock
         self._sensor = make_depth_sensor(rig, mode, config) if rig is not None else NoDepth()
         self._depth_offset = DepthOffset.expected(self._sensor.systematic_sigma)
@@ -300,17 +285,6 @@ class Frontend:
             tracks=arrows,
             stages_ms=stages_ms,
             near_share=session.near_share(),
-        )
-
-
-def _check_pair(rig: Rig | None) -> None:
-    """Raise CalibrationError unless there are two cameras between whose images flow can be followed."""
-    if rig is None or rig.cam1 is None:
-        raise CalibrationError("mode stereo needs a calibration of both cameras")
-    left, right = rig.cam0, rig.cam1
-    if (left.width, left.height) != (right.width, right.height):
-        raise CalibrationError(
-            f"mode stereo needs images of one size, not {left.width} x {left.height} and {right.width} x {right.height}"
         )
 
 

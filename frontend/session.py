@@ -19,7 +19,7 @@ from seamark.frontend.residuals import Observations
 from seamark.frontend.revisit import find_again, worth_revisiting
 from seamark.frontend.tracks import TrackAges, Tracks
 from seamark.frontend.two_view import normalised_rays
-from seamark.frontend.window import BundleProblem, LandmarkTable, WindowKeyframe, adjust
+from seamark.frontend.window import LandmarkTable, WindowKeyframe, adjust, bundle_of
 
 OUTLIER_PX = 4.0
 LIVE_KEYFRAMES = 2  # the newest of the window, whose landmarks are tracked still if they are seen
@@ -261,10 +261,10 @@ class Session:
         if len(self.window) <= n_fixed:
             return
         still = self._held_still()
-        problem, track_ids = self._bundle_problem([*still, *self.window], len(still) + n_fixed)
-        if problem is None:
+        views, c = [*still, *self.window], self.config
+        problem, track_ids = bundle_of(views, len(still) + n_fixed, self.landmarks, self.depth_offset)
+        if len(track_ids) < c.min_inliers:
             return
-        c = self.config
         result = adjust(problem, self.camera, pixel_sigma=c.pixel_sigma, iterations=c.window_iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.landmarks).all()):
             return
@@ -282,39 +282,3 @@ class Session:
         self.mapped = next((k for k in self.window if self.mapped and k.id == self.mapped.id), self.mapped)
         information = result.depth_information / c.window_keyframes
         self.depth_offset = self.depth_offset.learned(result.depth_offset, information)
-
-    def _bundle_problem(
-        self, views: list[WindowKeyframe], n_fixed: int
-    ) -> tuple[BundleProblem | None, NDArray[np.int64]]:
-        keyframe_of = np.concatenate([np.full(len(k.track_ids), i) for i, k in enumerate(views)])
-        ids = np.concatenate([k.track_ids for k in views])
-        first = ids.min()
-        count = np.bincount(ids - first)  # ids are given in turn: what a window sees lies close together
-        seen_often = np.flatnonzero(count >= 2)
-        positions = self.landmarks.get(seen_often + first)
-        known = np.isfinite(positions[:, 0])
-        track_ids, positions = seen_often[known] + first, positions[known]
-        if len(track_ids) < self.config.min_inliers:
-            return None, track_ids
-        number = np.full(len(count), -1, np.int32)
-        number[track_ids - first] = np.arange(len(track_ids))
-        landmark_of = number[ids - first]
-        use = np.flatnonzero(landmark_of >= 0)
-        use = use[np.argsort(landmark_of[use].astype(np.uint16 if len(track_ids) < 2**16 else np.int64), kind="stable")]
-        pixels = np.vstack([k.pixels for k in views])[use]
-        measured = Observations(
-            landmarks=np.zeros((len(use), 3)),
-            pixels=pixels,
-            inverse_depth=np.concatenate([k.inverse_depth for k in views])[use],
-            inverse_sigma=np.concatenate([k.inverse_sigma for k in views])[use],
-        )
-        problem = BundleProblem(
-            poses=np.stack([k.T_odom_cam for k in views]),
-            n_fixed=n_fixed,
-            landmarks=positions,
-            keyframe_of=keyframe_of[use],
-            landmark_of=landmark_of[use].astype(np.int64),
-            measured=measured,
-            depth_offset=self.depth_offset,
-        )
-        return problem, track_ids

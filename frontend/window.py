@@ -5,6 +5,7 @@ keyframe. A window of 8 keyframes and 500 landmarks is one small dense system: n
 the interpreter free, where plain arrays take 40 and a general graph solver about as long.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,26 +118,38 @@ class LandmarkTable:
     def get(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return positions (N, 3); forgotten and new ids are NaN."""
         out = np.full((len(track_ids), 3), np.nan)
-        index, held = self._find(track_ids)
+        index, held = self.rows(track_ids)
         out[held] = self._positions[index[held]]
         return out
 
     def known(self, track_ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
         """Return which of the ids (N,) have a position, and of those the positions (K, 3) and spreads (K,)."""
-        index, held = self._find(track_ids)
+        index, held = self.rows(track_ids)
         held[held] = np.isfinite(self._positions[index[held], 0])
         return held, self._positions[index[held]], self._spreads[index[held]]
+
+    def seen_often(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Return those of the rows (N,) that are there twice at least and have a position, ascending (K,), and these
+        positions (K, 3).
+        """
+        chosen = np.flatnonzero(np.bincount(rows, minlength=1) >= 2)
+        chosen = chosen[np.isfinite(self._positions[chosen, 0])]
+        return chosen, self._positions[chosen]
+
+    def ids(self, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Return the ids (N,) of rows."""
+        return self._ids[rows]
 
     def spread(self, track_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the spreads (N,); forgotten and new ids are NaN."""
         out = np.full(len(track_ids), np.nan)
-        index, held = self._find(track_ids)
+        index, held = self.rows(track_ids)
         out[held] = self._spreads[index[held]]
         return out
 
     def set(self, track_ids: NDArray[np.int64], positions: NDArray[np.float64], spreads: NDArray[np.float64]) -> None:
         """Store positions (N, 3) and spreads (N,) of different ids."""
-        index, held = self._find(track_ids)
+        index, held = self.rows(track_ids)
         self._positions[index[held]], self._spreads[index[held]] = positions[held], spreads[held]
         if held.all():
             return
@@ -151,8 +164,44 @@ class LandmarkTable:
         kept = np.isin(self._ids, track_ids)
         self._ids, self._positions, self._spreads = self._ids[kept], self._positions[kept], self._spreads[kept]
 
-    def _find(self, track_ids: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    def rows(self, track_ids: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Return the rows (N,) of ids, and which of them (N,) are held at all."""
         if len(self._ids) == 0:
             return np.zeros(len(track_ids), np.intp), np.zeros(len(track_ids), bool)
         index = np.minimum(np.searchsorted(self._ids, track_ids), len(self._ids) - 1)
         return index, self._ids[index] == track_ids
+
+
+def bundle_of(
+    views: Sequence[WindowKeyframe], n_fixed: int, table: LandmarkTable, depth_offset: DepthOffset
+) -> tuple[BundleProblem, NDArray[np.int64]]:
+    """Return what keyframes, the first ``n_fixed`` of which are held, say of each other through known landmarks.
+
+    The landmarks are those that are seen twice at least; their ids (L,) are returned as well.
+    """
+    ids = np.concatenate([k.track_ids for k in views])
+    keyframe_of = np.repeat(np.arange(len(views)), [len(k.track_ids) for k in views])
+    rows, held = table.rows(ids)
+    chosen, positions = table.seen_often(rows[held])
+    number = np.full(len(table) + 1, -1, np.int64)
+    number[chosen] = np.arange(len(chosen))
+    landmark_of = number[np.where(held, rows, -1)]
+    use = np.flatnonzero(landmark_of >= 0)
+    # a sort of 16-bit numbers takes one pass
+    use = use[np.argsort(landmark_of[use].astype(np.uint16 if len(chosen) < 2**16 else np.int64), kind="stable")]
+    measured = Observations(
+        landmarks=np.zeros((len(use), 3)),
+        pixels=np.vstack([k.pixels for k in views])[use],
+        inverse_depth=np.concatenate([k.inverse_depth for k in views])[use],
+        inverse_sigma=np.concatenate([k.inverse_sigma for k in views])[use],
+    )
+    problem = BundleProblem(
+        poses=np.stack([k.T_odom_cam for k in views]),
+        n_fixed=n_fixed,
+        landmarks=positions,
+        keyframe_of=keyframe_of[use],
+        landmark_of=landmark_of[use],
+        measured=measured,
+        depth_offset=depth_offset,
+    )
+    return problem, table.ids(chosen)
