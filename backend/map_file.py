@@ -29,24 +29,30 @@ _CORRUPT: Final = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
 
 
 class MapFile:
-    """A connection to the file ``path``, created when missing (unless ``read_only``); to be shared by threads.
+    """A connection to the file ``path``, created when missing (unless ``existing``); to be shared by threads.
 
     A writer has the file for itself; one of an older version is brought up to date. Readers come in any number, also
     while a writer is at work. While nobody writes, a reader leaves the folder as it was, to the byte. ``database`` is
     used inside of ``reading`` and ``writing`` only. A reader ``beside_writer`` never keeps a writer from coming, and
-    leaves SQLite's files in the folder.
+    leaves SQLite's files in the folder. What is ``read_only`` must be ``existing``.
 
     Raises MapInUseError for a second writer, MapVersionError for a file that is no map or of another version,
     MapCorruptError for damage, MapUnwritableError for what the disk refuses, MapError for the rest.
     """
 
-    def __init__(self, path: Path, read_only: bool = False, beside_writer: bool = False) -> None:
+    def __init__(
+        self, path: Path, read_only: bool = False, beside_writer: bool = False, existing: bool = False
+    ) -> None:
         self._beside_writer = beside_writer
         self.path = path
         self.read_only = read_only
         self._lock = threading.RLock()
-        if read_only and not path.exists():
+        if path.is_dir():
+            raise MapError(f"{path} is a folder, and a map is a file")
+        if (read_only or existing) and not path.exists():
             raise MapError(f"there is no map at {path}")
+        if existing and path.stat().st_size == 0:
+            raise MapVersionError(f"{path} is no map of Seamark")
         self._claim: MapLock | None = None
         with self.translated("opened"):
             self._claim = self._claimed()

@@ -40,7 +40,7 @@ def optimise_map(path: Path, config: BackendConfig) -> Optimised:
     The old poses stay where the new ones explain less of what was seen. Raises MapError when the map is in use, has no
     poses or cannot be read, SolverError when a component has no solution; nothing is written then.
     """
-    with MapStore(path) as store:
+    with MapStore(path, existing=True) as store:
         poses = {number: row for number, row in store.load_poses().items() if row[0] is not None}
         if not poses:
             raise MapError(f"{path} has no poses that could be optimised")

@@ -21,7 +21,7 @@ def prune_map(path: Path, keyframes: int, config: BackendConfig) -> Pruning:
     The last keyframe stays: the next one hangs on it. Nothing is solved. A disk without room for a second copy leaves
     the file as large as it was.
     """
-    with MapStore(path) as store:
+    with MapStore(path, existing=True) as store:
         mode = Mode(store.meta().get("mode", Mode.RGBD))
         solver = None if mode is Mode.PLACES else SolverProcess(config)  # it is asked nothing, so it never starts
         slam = Slam(config, mode, solver, 0, loader(store))

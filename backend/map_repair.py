@@ -41,6 +41,8 @@ def repair_map(path: Path, out: Path) -> RepairReport:
         raise MapError(f"{out} exists: a repair writes a new file")
     if not path.exists():
         raise MapError(f"there is no map at {path}")
+    if path.is_dir():
+        raise MapError(f"{path} is a folder, and a map is a file")
     report = RepairReport()
     partial = out.with_name(out.name + ".partial")
     partial.unlink(missing_ok=True)

@@ -60,7 +60,7 @@ class Session:
 
 
 class MapStore:
-    """Keyframes, loops and poses in the file ``path``, created when missing (unless ``read_only``).
+    """Keyframes, loops and poses in the file ``path``, created when missing (unless ``read_only`` or ``existing``).
 
     What a method has written is on disk when it returns (write-ahead log, full synchronisation); while the map is
     open, ``path-wal`` and ``path-shm`` belong to it, ``close`` makes it one file again. May be shared by threads.
@@ -68,9 +68,11 @@ class MapStore:
     :class:`~seamark.backend.map_file.MapFile`, and MapCorruptError for damage found by a checksum.
     """
 
-    def __init__(self, path: Path, read_only: bool = False, beside_writer: bool = False) -> None:
+    def __init__(
+        self, path: Path, read_only: bool = False, beside_writer: bool = False, existing: bool = False
+    ) -> None:
         self.path = path
-        self.file = MapFile(path, read_only, beside_writer)
+        self.file = MapFile(path, read_only, beside_writer, existing)
         self._cameras: dict[int, Camera] = {}
         self._written: dict[int, tuple[NDArray[np.float64], float]] = {}  # poses as they are in the file
 
