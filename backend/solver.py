@@ -3,10 +3,12 @@
 GTSAM holds Python's global lock while it solves: in the process that answers queries it would silence them.
 """
 
+import contextlib
 import fcntl
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -53,6 +55,7 @@ class SolverProcess:
         self._loops: set[Key] = set()
         self._process: SpawnProcess | None = None
         self._connection: Connection | None = None
+        self._sending: threading.Thread | None = None
         self._asked_at: float | None = None  # when the question was put that is still unanswered
         self._wanted = False  # another solution, once this one is there
         self._outdated = False  # the one that is being made is of a graph that was exchanged since
@@ -148,6 +151,11 @@ class SolverProcess:
 
     def close(self) -> None:
         """End the child, by force where it does not end by itself; harmless when repeated."""
+        if self._sending is not None and self._sending.is_alive():
+            if self._process is not None:
+                self._process.kill()  # or it would go on reading, and the thread writing to what is closed below
+            self._sending.join()
+        self._sending = None
         if self._connection is not None:
             self._connection.close()  # the child reads the end of the pipe, or is ended by it while it solves
         if self._process is not None:
@@ -184,7 +192,10 @@ class SolverProcess:
             self._start()
         assert self._connection is not None
         news = self._told[self._sent :]
-        self._connection.send((news, verb, arguments))
+        # A large map does not fit into the pipe, and the child reads it only once it has loaded GTSAM.
+        told = (self._connection, (news, verb, arguments))
+        self._sending = threading.Thread(target=_send, args=told, name="to-solver", daemon=True)
+        self._sending.start()
         self._sent = len(self._told)
         self._asked_at = time.monotonic()
 
@@ -224,6 +235,12 @@ class SolverProcess:
             self._process.kill()
         self.close()
         self.restarts += 1
+
+
+def _send(connection: Connection, message: tuple[Tells, str, tuple[Any, ...]]) -> None:
+    """Send a question; a child that has died meanwhile shows itself where the answer is expected."""
+    with contextlib.suppress(OSError):
+        connection.send(message)
 
 
 def _value(answer: tuple[bool, object]) -> object:

@@ -115,10 +115,10 @@ def test_a_map_that_could_only_be_read_is_taken_over_when_it_can_be_written(
         store.add_keyframe(keyframe(0))
     writable = False
 
-    def opened(path: Path, read_only: bool = False, beside_writer: bool = False) -> MapFile:
+    def opened(path: Path, read_only: bool = False, beside_writer: bool = False, existing: bool = False) -> MapFile:
         if not writable and not read_only:
             raise MapUnwritableError("read-only file system")
-        return MapFile(path, read_only, beside_writer)
+        return MapFile(path, read_only, beside_writer, existing)
 
     monkeypatch.setattr(map_store, "MapFile", opened)
     keeper = MapKeeper(MapStore(path, read_only=True), meter, patient=True)
