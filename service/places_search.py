@@ -31,7 +31,7 @@ DATABASE_SESSION, QUERY_SESSION, QUERY_ID = 0, 1, -1
 class Match:
     """One place for one query: ``place`` counts the images of the database, ``score`` is higher for better ones.
 
-    It compares queries too: where many places look alike, all of them score lower (confidence.doubt). ``inliers``
+    It compares queries too: where many places look alike, all of them score lower (Calibration.doubt). ``inliers``
     counts the features that agree in position; it is 0 for places that were not compared.
     """
 
@@ -197,7 +197,7 @@ def _answers(
         if evidence is None:
             score |= {place: score[place] + SUPPORT_WEIGHT * found.support for place, found in verified.items()}
         ranked = sorted(score, key=lambda place: (-score[place], place))
-        off = 0.0 if in_order else confidence.doubt([score[place] for place in ranked[:VERIFIED]])
+        off = 0.0 if in_order else calibration.doubt([score[place] for place in ranked[:VERIFIED]])
         if not in_order and ranked and verified[ranked[0]].inliers < confidence.MIN_INLIERS:
             off += confidence.FEW_INLIERS_DOUBT
         matches = [_match(table, row, place, score[place] - off, verified.get(place)) for place in ranked[:top]]

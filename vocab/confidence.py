@@ -16,7 +16,6 @@ FEW_INLIERS_DOUBT: Final = 1.0
 
 
 DOUBT_WEIGHT: Final = 0.4
-DOUBT_SPREAD: Final = 0.02  # scores of neighbouring places differ by about as much
 
 
 class Verdict(StrEnum):
@@ -37,11 +36,12 @@ class Calibration:
     """Weights of logistic regressions, found by benchmarks/calibrate_places.py (see docs/benchmarks.md).
 
     ``single``: of 1, the verified score and ln(1 + inliers). ``along_way``: of 1 and the mean evidence along the best
-    way, in standard deviations per image.
+    way, in standard deviations per image. ``spread``: by about as much scores of neighbouring places differ.
     """
 
     single: tuple[float, float, float]
     along_way: tuple[float, float]
+    spread: float
 
     def probability_single(self, score: float, inliers: int) -> float:
         """Return how probable it is that the best place of one image is the right one (logistic regression).
@@ -56,25 +56,25 @@ class Calibration:
         constant, slope = self.along_way
         return _logistic(constant + slope * evidence)
 
+    def doubt(self, scores: Sequence[float]) -> float:
+        """Return what to take off the scores of one query, best first, because several places are about as good.
 
-AS_THEY_ARE: Final = Calibration((-9.188, 14.04, 2.333), (-10.97, 5.461))
+        Nothing for a single place, 0.28 for two equal ones, up to 1.2 for twenty. It orders queries by how sure it is
+        that the first place is the very one, not one beside it (gardens_point, compared as they are: recall without an
+        error .18 without, .83 with half the weight, .89 with this one and up to three times as much; with one error
+        allowed .81, .90, .90).
+        """
+        if len(scores) == 0:
+            return 0.0
+        values = np.asarray(scores, np.float64)
+        return DOUBT_WEIGHT * float(np.log(np.exp((values - values.max()) / self.spread).sum()))
+
+
+AS_THEY_ARE: Final = Calibration((-9.491, 14.7, 2.406), (-10.79, 5.271), 0.02)
 """Of scores of the place index."""
 
-TRAVERSALS: Final = Calibration((-7.742, 14.25, 2.067), (-8.878, 4.984))
+TRAVERSALS: Final = Calibration((-7.534, 13.92, 2.034), (-8.896, 5.042), 0.04)
 """Of scores without what all images of either traversal have in common."""
-
-
-def doubt(scores: Sequence[float]) -> float:
-    """Return what to take off the scores of one query, best first, because several places are about as good.
-
-    Nothing for a single place, 0.28 for two equal ones, up to 1.2 for twenty. It orders queries by how sure it is that
-    the first place is the very one, not one beside it (gardens_point: recall without an error .18 without, .83 with
-    half the weight, .89 with this one and up to three times as much; with one error allowed .81, .90, .90).
-    """
-    if len(scores) == 0:
-        return 0.0
-    values = np.asarray(scores, np.float64)
-    return DOUBT_WEIGHT * float(np.log(np.exp((values - values.max()) / DOUBT_SPREAD).sum()))
 
 
 def _logistic(value: float) -> float:

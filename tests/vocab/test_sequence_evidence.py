@@ -71,11 +71,12 @@ def test_probabilities_grow_with_evidence_and_are_sure_of_little(calibration: co
     assert (np.diff(along) > 0).all() and along[1] < 0.05 and along[-1] > 0.95
 
 
-def test_doubt_grows_with_the_number_of_equals() -> None:
-    assert confidence.doubt([]) == 0 and confidence.doubt([0.4]) == 0
-    assert confidence.doubt([0.4, 0.4]) == pytest.approx(0.4 * np.log(2))
-    assert 0 < confidence.doubt([0.4, 0.3]) < 0.01
-    assert confidence.doubt([0.5] * 20) == pytest.approx(0.4 * np.log(20))
+@pytest.mark.parametrize("calibration", [confidence.AS_THEY_ARE, confidence.TRAVERSALS])
+def test_doubt_grows_with_the_number_of_equals(calibration: confidence.Calibration) -> None:
+    assert calibration.doubt([]) == 0 and calibration.doubt([0.4]) == 0
+    assert calibration.doubt([0.4, 0.4]) == pytest.approx(0.4 * np.log(2))
+    assert 0 < calibration.doubt([0.4, 0.3]) < 0.05
+    assert calibration.doubt([0.5] * 20) == pytest.approx(0.4 * np.log(20))
 
 
 def test_a_streak_lasts_while_neighbours_are_found() -> None:
