@@ -97,7 +97,8 @@ def test_a_full_disk_stops_learning_until_there_is_room(
 ) -> None:
     """Test: the disk fills up in mid-run. Expected: queries are answered, odometry goes on."""
     path, filler = disk / "map.seamark", disk / "filler"
-    with Launcher(settings) as launcher:
+    many = load_config(overrides=["frontend.keyframe_parallax_px=4", "vocab.exclude_recent_s=2"])  # beyond the window
+    with Launcher(replace(settings, config=many)) as launcher:
         sent = feed(launcher, frames[:20])
         drain(launcher)  # features are made beside the tracking, and may wait for the next frame
         assert counter(launcher, "keyframes") >= 3
