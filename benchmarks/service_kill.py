@@ -9,6 +9,7 @@ service that ends by itself must say why; it is started again. Prints one line o
 """
 
 import argparse
+import atexit
 import json
 import os
 import random
@@ -142,6 +143,7 @@ class Service:
         while time.monotonic() < began + PATIENCE_S:
             with self.log.open("wb") as log:
                 self.process = subprocess.Popen(self._command, stdout=log, stderr=subprocess.STDOUT)
+            atexit.register(self.process.terminate)  # where a promise is broken and nobody stops it
             while self.process.poll() is None and time.monotonic() < began + PATIENCE_S:
                 if b"seamark serves" in self.log.read_bytes():
                     return time.monotonic() - began
