@@ -14,6 +14,7 @@ from seamark.service.loop_commands import loops_command
 from seamark.service.map_commands import map_app
 from seamark.service.optimise_commands import optimise_command
 from seamark.service.places_commands import places_app
+from seamark.service.synth_commands import synth_app
 from seamark.service.terminal import Bar, errors, print_json, print_table
 
 # Everything else is imported in the command that needs it: --help must not wait for GTSAM, faiss and rerun.
@@ -31,7 +32,6 @@ app = typer.Typer(
 )
 vocab_app = typer.Typer(no_args_is_help=True, help="Visual vocabularies.")
 config_app = typer.Typer(no_args_is_help=True, help="The configuration.")
-synth_app = typer.Typer(no_args_is_help=True, help="Synthetic worlds with ground truth.")
 app.add_typer(vocab_app, name="vocab")
 app.add_typer(config_app, name="config")
 app.add_typer(synth_app, name="synth")
@@ -255,44 +255,6 @@ def vocab_train_command(
         print_json({"file": str(out), "words": vocabulary.n_words, "hash": vocabulary.hash})
     else:
         sys.stdout.write(f"{out}: {vocabulary.n_words} words, hash {vocabulary.hash[:16]}\n")
-
-
-@synth_app.command("list")
-def synth_list_command(as_json: JsonOption = False) -> None:
-    """Print the worlds, what can be set, and the ready-made scenarios."""
-    from seamark.service import synth
-
-    content = synth.catalogue()
-    if as_json:
-        print_json(content)
-        return
-    for table in synth.tables(content):
-        print_table(table)
-
-
-@synth_app.command("render")
-def synth_render_command(
-    world: Annotated[str, typer.Argument(help="A world or scenario, with settings: NAME[,key=value...].")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to make; an interrupted rendering goes on there.")],
-    trajectory: Annotated[str | None, typer.Option("--trajectory", help="How the camera moves.")] = None,
-    sensors: Annotated[str | None, typer.Option("--sensors", help="rgbd, stereo or mono.")] = None,
-    condition: Annotated[str | None, typer.Option("--condition", help="Light, such as day or night.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the world and all errors (default 0).")] = None,
-    frames: Annotated[int | None, typer.Option("--frames", help="Number of frames.")] = None,
-    layout: Annotated[str, typer.Option("--layout", help="tum, euroc or kitti.")] = "tum",
-    as_json: JsonOption = False,
-) -> None:
-    """Write a synthetic sequence with its ground truth and motion sensors to a folder."""
-    from seamark.service import synth
-
-    options = synth.RenderOptions(world, trajectory, sensors, condition, seed, frames)
-    with Bar(f"synth {world}") as bar:
-        written = synth.render(options, layout, out, bar.count)
-    if as_json:
-        print_json(written)
-    else:
-        again = f", {written['resumed']} of them from before" if written["resumed"] else ""
-        sys.stdout.write(f"{out}: {written['frames']} frames of {written['synth']} in layout {layout}{again}\n")
 
 
 @config_app.command("show")
