@@ -32,7 +32,7 @@ from seamark.vocab.types import Candidates, PlaceObservation
 from seamark.vocab.vocabulary import Vocabulary
 
 MOST_FRAMES = 300
-VERSION = 1  # of what is kept below
+VERSION = 2  # of what is kept below
 
 
 @dataclass(frozen=True)
