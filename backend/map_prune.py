@@ -55,13 +55,13 @@ def choose(
     relations = Relations(views, joined, config)
     kept = np.ones(len(views), bool)
     may_go = np.array([view.id not in spared for view in views], bool)
+    wanted = len(views) - keep if most is None else min(len(views) - keep, most)
     forgotten: list[int] = []
     for rows in relations.blocks(COMPARED):
-        least = len(views) - keep if most is None else min(len(views) - keep, most)
-        if len(forgotten) >= least:
+        if len(forgotten) >= wanted:
             break
         relations.compare(rows, kept)
-        forgotten += _thin(relations, rows, kept, may_go, least - len(forgotten))
+        forgotten += _thin(relations, rows, kept, may_go, wanted - len(forgotten))
     return Pruning(tuple(views[row].id for row in forgotten), int(kept.sum()), keep)
 
 

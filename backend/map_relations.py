@@ -14,6 +14,7 @@ Vector = NDArray[np.float64]
 Rows = NDArray[np.intp]
 PAIRS_AT_ONCE: Final = 400_000
 NOWHERE: Final = -1  # the cell of views without a pose
+LIGHTING: Final = 6  # numbers that say in which lighting a view was taken
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Relations:
     def __init__(self, views: list[View], joined: Iterable[tuple[int, int]], config: MapConfig) -> None:
         count = len(views)
         self._config = config
-        self._lighting = np.array([view.lighting for view in views], np.float64).reshape(count, -1)
+        self._lighting = np.array([view.lighting for view in views], np.float64).reshape(count, LIGHTING)
         self._posed = np.array([view.position is not None for view in views], bool)
         self._position, self._direction = np.zeros((count, 3)), np.zeros((count, 3))
         for row, view in enumerate(views):

@@ -1,12 +1,16 @@
 """Pruning: a budget is kept as far as it can be, and every place keeps a view of each lighting."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from seamark.backend import map_prune, map_relations
-from seamark.backend.config import MapConfig
+from seamark.backend.config import BackendConfig, MapConfig
 from seamark.backend.map_codec import lighting_of
-from seamark.backend.map_prune import View, choose
+from seamark.backend.map_prune import Pruning, View, choose
+from seamark.backend.map_pruning import prune_map
+from seamark.backend.map_store import MapStore
 
 CONFIG = MapConfig(place_m=1.0, place_deg=20.0, lighting=0.12)
 DAY, NIGHT = np.array([0.6, 0.6, 0.6, 0.2, 0.2, 0.2]), np.array([0.1, 0.1, 0.15, 0.1, 0.1, 0.1])
@@ -83,6 +87,15 @@ def test_a_budget_is_met_exactly_where_places_allow_it_and_the_oldest_go_first()
 def test_lightings_and_components_are_places_of_their_own() -> None:
     views = [view(0, 0), view(1, 0, light=NIGHT), view(2, 0, component=1), view(3, 0, 90)]
     assert choose(views, 1, (), CONFIG).forget == ()
+
+
+def test_a_map_without_views_has_none_to_forget(tmp_path: Path) -> None:
+    """Test: a service was stopped before its first keyframe. Expected: its map is pruned like any other."""
+    assert choose([], 10, (), CONFIG) == Pruning((), 0, 10)
+    path = tmp_path / "map.seamark"
+    with MapStore(path):
+        pass
+    assert prune_map(path, 10, BackendConfig()) == Pruning((), 0, 10)
 
 
 def test_without_poses_loops_say_what_stands_for_what() -> None:
