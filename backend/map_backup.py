@@ -17,6 +17,7 @@ def back_up_map(path: Path, out: Path) -> int:
         raise MapError(f"{out} exists: a backup writes a new file")
     partial = out.with_name(out.name + ".partial")
     try:
+        _remove(partial)  # of a backup that was killed: it may be no database
         with MapStore(path, read_only=True) as store:
             store.copy(partial)
         _sync(partial)
@@ -26,8 +27,12 @@ def back_up_map(path: Path, out: Path) -> int:
     except OSError as error:
         raise MapError(f"{out} cannot be written: {error.strerror}") from error
     finally:
-        for leftover in (partial, *(partial.with_name(partial.name + end) for end in ("-wal", "-shm", "-journal"))):
-            leftover.unlink(missing_ok=True)
+        _remove(partial)
+
+
+def _remove(path: Path) -> None:
+    for one in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))):
+        one.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:

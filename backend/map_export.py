@@ -222,8 +222,8 @@ def _batches(positions: Iterable[NDArray[np.float64]]) -> Iterator[NDArray[np.fl
 def _made_whole(out: Path) -> Iterator[Path]:
     """Give the name under which a file or folder is made, which gets its own name when all is written."""
     partial = out.with_name(out.name + ".partial")
-    _remove(partial)  # of an export that was killed
     try:
+        _remove(partial)  # of an export that was killed
         yield partial
         partial.rename(out)
     except OSError as error:
