@@ -5,6 +5,7 @@ off the frame's latency, and gives way where there is one core only. Keyframes c
 nothing that the tracker decides depends on when.
 """
 
+import contextlib
 import os
 import sys
 import threading
@@ -49,8 +50,9 @@ class KeyframeRequest:
 def _give_way() -> None:
     """Let tracking go first where there is one core for both: what this thread makes can wait, a pose cannot."""
     if sys.platform == "linux":  # elsewhere it would be the whole process that gives way
-        niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+        with contextlib.suppress(OSError):  # a sandbox may forbid it, and then all goes on as on other systems
+            niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
 
 
 class KeyframeBuilder:
