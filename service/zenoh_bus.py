@@ -19,6 +19,7 @@ from seamark.service.bus import (
     UnavailableError,
     WrongKindError,
     check_kind,
+    error_reply,
 )
 from seamark.service.topics import Congestion, Kind, Reliability, Topic
 from seamark.service.wire import WireError, decode, encode, encoding_of
@@ -281,7 +282,7 @@ class ZenohBus:
                 self._dropped[topic.name] = self._dropped.get(topic.name, 0) + max(0, missed)
                 callback(decode(payload_of(sample), topic.message))
             except WireError as error:
-                logger.warning("a message on %s was ignored: %s", topic.name, error)
+                self._count_refused(topic.name, error_reply(error))
             except BusClosedError:
                 return
             except Exception:

@@ -154,6 +154,7 @@ class BackendNode:
     def _status(self) -> Status:
         self._meter.keep("feature_bytes", self._slam.feature_bytes)
         self._meter.keep("localised", int(self._slam.localised))
+        self._meter.keep_refused(self._bus.refused)
         return self._meter.status()
 
     def _refuse(self, keyframe_id: int) -> None:

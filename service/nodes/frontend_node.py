@@ -103,6 +103,7 @@ class FrontendNode:
     def _status(self) -> Status:
         for stream, missed in self._bus.dropped.items():
             self._meter.keep(f"{stream}_dropped", missed)
+        self._meter.keep_refused(self._bus.refused)
         return self._meter.status()
 
     def _on_drain(self, _: object) -> Done:

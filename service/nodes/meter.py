@@ -35,6 +35,11 @@ class Meter:
         with self._lock:
             self._counters[name] = value
 
+    def keep_refused(self, by_topic: Mapping[str, int]) -> None:
+        """Set how many messages of each topic were refused."""
+        for topic, count in by_topic.items():
+            self.keep(f"{topic}_refused", count)
+
     def add(self, stages_ms: Mapping[str, float]) -> None:
         """Note one latency in ms per stage."""
         with self._lock:

@@ -104,8 +104,7 @@ class VocabNode:
             return self._index.query(observation)
 
     def _on_status(self, _: object) -> Status:
-        for topic, count in self._bus.refused.items():
-            self._meter.keep(f"{topic}_refused", count)
+        self._meter.keep_refused(self._bus.refused)
         return self._meter.status()
 
     def _on_drain(self, _: object) -> Done:

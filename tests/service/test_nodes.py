@@ -460,3 +460,14 @@ def test_a_budget_is_kept_and_the_vocabulary_forgets_too(vocabulary: Vocabulary,
     counters = bus.request(topics.STATUS["backend"], Empty()).counters
     assert counters["views_forgotten"] == 41 - len(kept) and counters["views_over_budget"] == len(kept) - 9
     node.close()
+
+
+def test_every_node_says_what_it_has_refused(vocabulary: Vocabulary, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LocalBus, "refused", {"keyframe": 3, "frame": 1})
+    bus = LocalBus()
+    FrontendNode(bus.for_node("frontend"), FakeFrontend())  # type: ignore[arg-type]
+    VocabNode(bus.for_node("vocab"), PlaceIndex(vocabulary))
+    BackendNode(bus.for_node("backend"), FakeSlam(), None, FrontendConfig())
+    for node in topics.NODES:
+        counters = bus.request(topics.STATUS[node], Empty()).counters
+        assert counters["keyframe_refused"] == 3 and counters["frame_refused"] == 1

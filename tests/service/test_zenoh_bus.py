@@ -344,6 +344,7 @@ def test_a_failing_subscriber_and_garbage_do_not_end_a_stream(net: Net, caplog: 
         for number in range(2):
             a.publish(STREAM, message(number))
             wait_until(lambda number=number: seen[-1:] == [number])  # type: ignore[misc]
+    assert b.refused == {STREAM.name: 2} and a.refused == {}
 
 
 def test_closing_releases_a_waiting_sender_and_settles_everything(net: Net) -> None:
