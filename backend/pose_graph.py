@@ -12,12 +12,12 @@ from seamark.backend.config import BackendConfig, DriftConfig, GraphConfig
 from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.drift import drift_share
 from seamark.backend.errors import BackendInputError, SolverError
-from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_constraint, check_node
+from seamark.backend.graph_poses import GraphPoses
+from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_constraint
 from seamark.backend.graph_variables import PlanarVariables, PoseVariables, SimilarityVariables
 from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
-_FIRST_ROWS = 1024
 HELD_SIGMA: Final = 1e-5  # rad and units of length: nothing that is measured moves such a pose
 STRETCH: Final = 10  # loops of so many neighbouring keyframes close the same way
 
@@ -25,13 +25,12 @@ STRETCH: Final = 10  # loops of so many neighbouring keyframes close the same wa
 class PoseGraph:
     """Keyframes joined by odometry and loops, solved by iSAM2 (Kaess et al. 2012) with robust (Cauchy) loops.
 
-    Each session starts as a component of its own in its odometry's frame. A loop between sessions joins their
-    components: the older session's frame holds, the younger one is moved. Keyframes without a new loop need no solving:
-    they hang on the last pose by their odometry. A loop within a component is an incremental update; joining,
-    withdrawing and ``thorough`` solve all by Levenberg-Marquardt, and so does an incremental update that failed or
-    did not lower the error. Metric sessions have rigid poses. From the first session without metric scale on all
-    poses are similarities whose scale may drift (rigid motions in metric sessions keep it). ``planar``: all motions are
-    in the plane z = 0, and so are the poses.
+    Keyframes without a new loop need no solving: they hang on the last pose by their odometry. A loop within a
+    component (see :class:`~seamark.backend.graph_poses.GraphPoses`) is an incremental update; joining, withdrawing and
+    ``thorough`` solve all by Levenberg-Marquardt, and so does an incremental update that failed or did not lower the
+    error. Metric sessions have rigid poses. From the first session without metric scale on all poses are similarities
+    whose scale may drift (rigid motions in metric sessions keep it). ``planar``: all motions are in the plane z = 0,
+    and so are the poses.
     """
 
     def __init__(self, config: BackendConfig, planar: bool = False) -> None:
@@ -43,14 +42,8 @@ class PoseGraph:
 
     def _clear(self) -> None:
         """Begin without keyframes."""
-        self._nodes: list[Node] = []
-        self._rows: dict[int, int] = {}
-        self._before: list[int] = []  # row of the predecessor, -1 where a session starts
-        self._first_rows: dict[int, int] = {}  # session -> row of its first and of its last keyframe
-        self._last_rows: dict[int, int] = {}
-        self._poses = np.tile(np.eye(4), (_FIRST_ROWS, 1, 1))  # [sR t; 0 1] from keyframe to map
+        self._poses = GraphPoses()
         self._loops: dict[Key, Constraint] = {}
-        self._frames: dict[int, int] = {}  # session -> session in whose frame its poses are
         self._variables: PoseVariables = self._kind(self._config, self._drift)
         self._isam: gtsam.ISAM2 | None = None
         self._solved_rows = 0  # those that iSAM2 knows
@@ -62,26 +55,10 @@ class PoseGraph:
 
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed or was given before."""
-        check_node(node)
-        if node.id in self._rows:
-            raise BackendInputError(f"keyframe {node.id} was given twice")
-        before = self._last_rows.get(node.session, -1)
-        if node.previous_id is not None:
-            before = self._rows.get(node.previous_id, -1)
-            if before < 0 or self._nodes[before].session != node.session:
-                raise BackendInputError(f"keyframe {node.id} follows {node.previous_id}, which is not in its session")
+        self._poses.add(node)
         if not node.metric and not isinstance(self._variables, SimilarityVariables):
             self._variables = SimilarityVariables(self._config, self._drift)
             self._isam = None
-        row = self._rows[node.id] = len(self._nodes)
-        self._nodes.append(node)
-        self._before.append(before)
-        self._first_rows.setdefault(node.session, row)
-        self._last_rows[node.session] = row
-        self._frames.setdefault(node.session, node.session)
-        if row == len(self._poses):
-            self._poses = np.concatenate([self._poses, self._poses])
-        self._poses[row] = node.T_odom_cam if before < 0 else self._poses[before] @ self._motion(row)
 
     def restore(
         self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
@@ -92,16 +69,11 @@ class PoseGraph:
         """
         for node in nodes:
             self.add_keyframe(node)
-        poses = estimate.T_map_cam.copy()
-        poses[:, :3, :3] *= estimate.scales[:, None, None]
-        rows = [self._rows[number] for number in estimate.keyframe_ids.tolist()]
-        self._poses[rows] = poses
-        for row, component in zip(rows, estimate.components.tolist(), strict=True):
-            self._frames[self._nodes[row].session] = component
+        self._poses.take(estimate)
         for constraint in constraints:
             self.add_loop(constraint)
         self._revision = estimate.revision
-        self._held_rows = len(self._nodes) if held else 0
+        self._held_rows = len(self._poses) if held else 0
 
     def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
         """Take in another graph, as ``restore`` does, in place of all that was told before."""
@@ -113,7 +85,7 @@ class PoseGraph:
         check_constraint(constraint)
         key = constraint.key
         for keyframe_id in key:
-            if keyframe_id not in self._rows:
+            if keyframe_id not in self._poses.rows:
                 raise BackendInputError(f"{constraint.name} names keyframe {keyframe_id}, which is not known")
         if key in self._loops:
             self._isam = None
@@ -139,21 +111,21 @@ class PoseGraph:
 
     def optimise(self, thorough: bool = False) -> Estimate:
         """Return the poses with all loops so far; raises SolverError when no finite solution is found."""
-        moved = self._settle_frames()
+        moved = self._poses.settle(self._loops)
         self._learn_drift()
         if moved or thorough:
             self._solve_batch()
         elif self._new_loops or self._isam is None:
             self._solve_incremental()
         self._revision += 1
-        return self._estimate()
+        return self._poses.estimate(self._revision, isinstance(self._variables, SimilarityVariables))
 
     def weights(self) -> dict[Key, float]:
         """Return the weight (0..1) that the robust kernel leaves each loop at the present poses."""
         if not self._loops:
             return {}
         loops = list(self._loops.values())
-        query, match = (self._poses[[self._rows[key[end]] for key in self._loops]] for end in (0, 1))
+        query, match = (self._poses.matrices[[self._poses.rows[key[end]] for key in self._loops]] for end in (0, 1))
         expected = np.linalg.inv(match) @ query
         error, log_scale = cycle_error(np.linalg.inv(np.stack([similarity(loop) for loop in loops])) @ expected)
         covariance = np.stack([loop.covariance for loop in loops])
@@ -168,11 +140,11 @@ class PoseGraph:
         Relative to the first keyframe of the component, as of the last ``optimise``. Raises BackendInputError for a
         keyframe that is not known, SolverError where the system is indeterminate.
         """
-        unknown = [keyframe_id for keyframe_id in keyframe_ids if keyframe_id not in self._rows]
+        unknown = [keyframe_id for keyframe_id in keyframe_ids if keyframe_id not in self._poses.rows]
         if unknown:
             raise BackendInputError(f"keyframe {unknown[0]} is not known")
         try:
-            if self._isam is None or self._solved_rows < len(self._nodes):
+            if self._isam is None or self._solved_rows < len(self._poses):
                 self._solve_incremental()
             assert self._isam is not None
             blocks = [self._isam.marginalCovariance(keyframe_id) for keyframe_id in keyframe_ids]
@@ -183,15 +155,11 @@ class PoseGraph:
     def close(self) -> None:
         """Do nothing: this solver holds no resources."""
 
-    def _motion(self, row: int) -> Matrix:
-        """Return the odometry's motion from the keyframe to its predecessor."""
-        return se3.inverse(self._nodes[self._before[row]].T_odom_cam) @ self._nodes[row].T_odom_cam
-
     def _learn_drift(self) -> None:
         """Ask the loops how much odometry drifts, when there are new ones."""
         if not self._config.learn_drift or not self._new_loops:
             return
-        for node in self._nodes[len(self._chains.nodes()) :]:
+        for node in self._poses.nodes[len(self._chains.nodes()) :]:
             self._chains.add(node)
         share = drift_share(list(self._loops.values()), self._chains, STRETCH)
         if share != self._share:
@@ -202,11 +170,11 @@ class PoseGraph:
         fresh = self._isam is None
         if self._isam is None:
             self._isam = self._variables.make_isam()
-        rows = range(0 if fresh else self._solved_rows, len(self._nodes))
+        rows = range(0 if fresh else self._solved_rows, len(self._poses))
         graph = self._factors(rows, self._loops if fresh else self._new_loops)
         try:
             error = before = self._isam.getFactorsUnsafe().error(self._isam.calculateEstimate())
-            before += graph.error(self._values(self._rows[key] for key in graph.keyVector()))
+            before += graph.error(self._values(self._poses.rows[key] for key in graph.keyVector()))
             self._isam.update(graph, self._values(rows))
             for _ in range(self._config.incremental_updates):
                 if self._isam.update().getVariablesRelinearized() == 0:
@@ -219,55 +187,53 @@ class PoseGraph:
             self._solve_batch()
             return
         self._keep(estimate)
-        self._solved_rows = len(self._nodes)
+        self._solved_rows = len(self._poses)
 
     def _solve_batch(self) -> None:
         """Solve the whole graph from the current poses."""
         self._isam = None
-        if not self._nodes:
+        if not len(self._poses):
             return
-        rows = range(len(self._nodes))
+        rows = range(len(self._poses))
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self._config.batch_iterations)
         try:
             graph = self._factors(rows, self._loops)
             estimate = gtsam.LevenbergMarquardtOptimizer(graph, self._values(rows), parameters).optimize()
         except RuntimeError as error:
-            raise SolverError(f"the pose graph of {len(self._nodes)} keyframes has no solution: {error}") from error
+            raise SolverError(f"the pose graph of {len(self._poses)} keyframes has no solution: {error}") from error
         self._keep(estimate)
 
     def _keep(self, values: gtsam.Values) -> None:
         """Take over a solution; raises SolverError when it is not finite."""
-        ids = self._ids()
-        order = np.argsort(ids, kind="stable")
-        poses = self._variables.matrices(values, ids[order])
+        ids, rows = self._poses.by_id()
+        poses = self._variables.matrices(values, ids)
         if not np.isfinite(poses).all():
             self._isam = None
             raise SolverError(f"the pose graph of {len(ids)} keyframes has no finite solution")
-        self._poses[order] = poses
+        self._poses.matrices[rows] = poses
         self._new_loops.clear()
 
     def _factors(self, rows: Sequence[int], loops: Iterable[Key]) -> gtsam.NonlinearFactorGraph:
         """Return the factors that these keyframes and loops bring."""
         graph = gtsam.NonlinearFactorGraph()
-        held = self._held_rows
-        joined = [row for row in rows if self._before[row] >= 0 and row >= held]
+        poses, held = self._poses, self._held_rows
+        joined = [row for row in rows if poses.before[row] >= 0 and row >= held]
         for row in rows:
-            node = self._nodes[row]
+            node = poses.nodes[row]
             if row < held:
-                graph.add(self._variables.prior(node.id, self._poses[row], HELD_SIGMA))
-            elif self._before[row] < 0 and self._frames[node.session] == node.session:
-                graph.add(self._variables.prior(node.id, self._poses[row]))
+                graph.add(self._variables.prior(node.id, poses.matrices[row], HELD_SIGMA))
+            elif poses.before[row] < 0 and poses.frames[node.session] == node.session:
+                graph.add(self._variables.prior(node.id, poses.matrices[row]))
         if joined:
-            nodes, previous = (
-                [self._nodes[row] for row in which] for which in (joined, [self._before[r] for r in joined])
-            )
+            nodes = [poses.nodes[row] for row in joined]
+            previous = [poses.nodes[poses.before[row]] for row in joined]
             motions = se3.inverse(np.stack([x.T_odom_cam for x in previous])) @ np.stack([x.T_odom_cam for x in nodes])
             covariances = white_covariances(nodes, motions, self._drift, self._share)
             for before, node, motion, covariance in zip(previous, nodes, motions, covariances, strict=True):
                 graph.add(self._variables.odometry(before.id, node, motion, covariance))
         for key in loops:
-            if key in self._loops and max(self._rows[number] for number in key) >= held:
+            if key in self._loops and max(poses.rows[number] for number in key) >= held:
                 graph.add(self._variables.loop(self._loops[key]))
         return graph
 
@@ -275,72 +241,5 @@ class PoseGraph:
         """Return the present poses of these rows."""
         values = gtsam.Values()
         for row in rows:
-            values.insert(self._nodes[row].id, self._variables.value(self._poses[row]))
+            values.insert(self._poses.nodes[row].id, self._variables.value(self._poses.matrices[row]))
         return values
-
-    def _settle_frames(self) -> bool:
-        """Move sessions into the frame of their component's oldest session; return whether any frame has changed."""
-        wanted = self._components()
-        changed = False
-        for root in sorted(set(wanted.values())):
-            if self._frames[root] != root:  # a withdrawn loop has set this component free
-                first = self._first_rows[root]
-                G = self._nodes[first].T_odom_cam @ np.linalg.inv(self._poses[first])
-                self._move(self._frames[root], root, G, wanted)
-                changed = True
-        pending = len(wanted) > 1
-        while pending:
-            pending = False
-            for (query_id, match_id), constraint in sorted(self._loops.items(), key=lambda item: item[0]):
-                query, match = self._rows[query_id], self._rows[match_id]
-                a, b = self._nodes[match].session, self._nodes[query].session
-                root = wanted[a]
-                if (self._frames[a] == root) == (self._frames[b] == root):
-                    continue
-                S = similarity(constraint)
-                if self._frames[a] == root:
-                    G = self._poses[match] @ S @ np.linalg.inv(self._poses[query])
-                    self._move(self._frames[b], root, G, wanted)
-                else:
-                    G = self._poses[query] @ np.linalg.inv(S) @ np.linalg.inv(self._poses[match])
-                    self._move(self._frames[a], root, G, wanted)
-                changed = pending = True
-        return changed
-
-    def _move(self, old: int, new: int, G: NDArray[np.floating], wanted: dict[int, int]) -> None:
-        """Map all sessions that are in frame ``old`` and belong to component ``new`` by G into frame ``new``."""
-        moved = {session for session, frame in self._frames.items() if frame == old and wanted[session] == new}
-        rows = np.array([row for row, node in enumerate(self._nodes) if node.session in moved], np.int64)
-        self._poses[rows] = G @ self._poses[rows]
-        self._frames.update(dict.fromkeys(moved, new))
-
-    def _components(self) -> dict[int, int]:
-        """Return for each session the oldest one that loops join it with."""
-        roots = {session: session for session in self._frames}
-        if len(roots) < 2:
-            return roots
-
-        def root_of(session: int) -> int:
-            while roots[session] != session:
-                session = roots[session]
-            return session
-
-        for key in self._loops:
-            a, b = (root_of(self._nodes[self._rows[keyframe_id]].session) for keyframe_id in key)
-            roots[max(a, b)] = min(a, b)
-        return {session: root_of(session) for session in roots}
-
-    def _ids(self) -> NDArray[np.int64]:
-        return np.array([node.id for node in self._nodes], np.int64)
-
-    def _estimate(self) -> Estimate:
-        ids = self._ids()
-        order = np.argsort(ids, kind="stable")
-        poses = self._poses[order]
-        scales = np.ones(len(ids))  # exactly, where all is metric
-        if isinstance(self._variables, SimilarityVariables):
-            scales = np.cbrt(np.linalg.det(poses[:, :3, :3]))
-        T_map_cam = poses.copy()
-        T_map_cam[:, :3, :3] /= scales[:, None, None]
-        components = np.array([self._frames[node.session] for node in self._nodes], np.int64)[order]
-        return Estimate(self._revision, ids[order], components, T_map_cam, scales)
