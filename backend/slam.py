@@ -13,16 +13,16 @@ from seamark.backend.consistency import gate_chi2
 from seamark.backend.contraction import contract
 from seamark.backend.errors import BackendInputError
 from seamark.backend.evidence import Evidence, Gate
-from seamark.backend.graph_types import Constraint, Estimate, Node, Solver, Span, check_nodes
+from seamark.backend.graph_types import Constraint, Estimate, Matrix, Node, Solver, Span, check_nodes
 from seamark.backend.judge import PoseJudge
 from seamark.backend.judge_places import PlaceJudge
 from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
-from seamark.backend.likelihood import probability
 from seamark.backend.map_contraction import Contracted, Mean, contracted
 from seamark.backend.map_memory import KeyframeMemory, Load
 from seamark.backend.map_state import MapState, StoredPose
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
-from seamark.backend.verify import Rejected, Verification, pair_seed, verify
+from seamark.backend.verify import Rejected, Verification
+from seamark.backend.verify_candidates import CandidateVerifier, Verified
 from seamark.frontend.types import Keyframe, Mode
 from seamark.vocab.types import Candidate, Candidates
 
@@ -55,12 +55,13 @@ class Slam:
     ) -> None:
         if (mode == Mode.PLACES) != (solver is None):
             raise BackendInputError(f"mode {mode} needs {'no' if mode == Mode.PLACES else 'a'} solver")
-        self._config, self._solver, self._seed = config, solver, seed
+        self._config, self._solver = config, solver
         self._chains = OdometryChains(config.drift)
         self._ledger = LoopLedger(self._judge())
         self._map = MapState()
         self._unsolved = False
         self._memory = KeyframeMemory(config.map.memory_mb << 20, load)
+        self._verifier = CandidateVerifier(config, mode, seed, self._memory)
         self._loops: dict[Key, Loop] = {}
         self._means: dict[Key, Mean] = {}  # of composed loops
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
@@ -216,13 +217,7 @@ class Slam:
         """
         with self._lock:
             known = self._map.keyframes.copy()
-        places = []
-        for candidate in self._islands(candidates, known, None):
-            match = self._memory.whole(known[candidate.id])
-            result = verify(query, match, self._config.verification, pair_seed(self._seed, query.id, match.id))
-            likely = probability(query, match, candidate.score)
-            places.append(self._place(candidate, match, result, likely))
-        return tuple(sorted(places, key=lambda place: (not place.accepted, -place.inliers)))
+        return self._verifier.of_image(query, candidates, known, self._pose_of_neighbour)
 
     def _add(self, keyframe: Keyframe) -> None:
         """Take the keyframe into memory and, but in mode places, into the graph."""
@@ -251,55 +246,8 @@ class Slam:
                 self._map.add(self._memory.add(one), None if poses is None else poses.get(one.id))
         return nodes
 
-    def _verify(self, keyframe: Keyframe, candidates: Candidates) -> list[tuple[Candidate, Verification | Rejected]]:
-        """Compare the keyframe with the best candidate of each island."""
-        verified = []
-        for candidate in self._islands(candidates, self._map.keyframes, keyframe):
-            match = self._memory.whole(self._map.keyframes[candidate.id])
-            seed = pair_seed(self._seed, keyframe.id, candidate.id)
-            verified.append((candidate, verify(keyframe, match, self._config.verification, seed)))
-        return verified if self._solver is not None else self._best_of_islands(verified)
-
-    def _best_of_islands(
-        self, verified: list[tuple[Candidate, Verification | Rejected]]
-    ) -> list[tuple[Candidate, Verification | Rejected]]:
-        """Without poses a place is the image nearest to where the query was taken: its neighbours, which see much
-        the same with fewer inliers, are refused as INCONSISTENT with it.
-        """
-        radius = self._config.places.island_images
-        best: list[int] = []
-        for candidate, result in sorted(verified, key=lambda pair: -pair[1].inliers):
-            if isinstance(result, Verification) and all(abs(candidate.id - other) > radius for other in best):
-                best.append(candidate.id)
-        return [
-            (candidate, result)
-            if isinstance(result, Rejected) or candidate.id in best
-            else (candidate, Rejected(Reason.INCONSISTENT, result.inliers, result.matches))
-            for candidate, result in verified
-        ]
-
-    def _islands(
-        self, candidates: Candidates, known: dict[int, Keyframe], keyframe: Keyframe | None
-    ) -> list[Candidate]:
-        """Return the best candidate of each island of neighbouring keyframes; the recent past is none."""
-        config = self._config.verification
-        count, radius = config.candidates, config.island_keyframes
-        if self._solver is None:  # a place is an image: all are compared, see _best_of_islands
-            count, radius = self._config.places.candidates, 0
-        chosen: list[Candidate] = []
-        for candidate in candidates.ranked:
-            match = known.get(candidate.id)
-            if match is None or (keyframe is not None and match.id == keyframe.id):
-                continue
-            recent = keyframe is not None and keyframe.session == match.session
-            if recent and keyframe is not None and abs(keyframe.id - match.id) < config.min_gap_keyframes:
-                continue
-            near = (abs(other.id - match.id) <= radius and known[other.id].session == match.session for other in chosen)
-            if not any(near):
-                chosen.append(candidate)
-            if len(chosen) == count:
-                break
-        return chosen
+    def _verify(self, keyframe: Keyframe, candidates: Candidates) -> Verified:
+        return self._verifier.of_keyframe(keyframe, candidates, self._map.keyframes)
 
     def _enter(self, keyframe: Keyframe, candidate: Candidate, result: Verification | Rejected) -> list[Key]:
         """Write the loop's row with its verdict; return the rows that are new or changed."""
@@ -380,31 +328,9 @@ class Slam:
         with self._lock:
             self._map.take(estimate)
 
-    def _place(self, candidate: Candidate, match: Keyframe, result: Verification | Rejected, likely: float) -> Place:
-        """Say what the comparison of a query image with one keyframe means."""
-        reason, T_map_cam = Reason.ACCEPTED, None
-        if isinstance(result, Rejected):
-            reason = result.reason
-        elif result.inliers < self._config.verification.locate_inliers:
-            reason = Reason.UNCONFIRMED
-        elif result.T_match_query is not None:
-            with self._lock:
-                T_map_cam = self._map.pose_of_neighbour(match.id, result.T_match_query)
-        return Place(
-            keyframe_id=match.id,
-            session=match.session,
-            stamp_ns=match.stamp_ns,
-            file=match.file,
-            score=candidate.score,
-            votes=candidate.votes,
-            jeffrey=candidate.jeffrey,
-            inliers=result.inliers,
-            accepted=reason == Reason.ACCEPTED,
-            reason=reason,
-            T_map_cam=T_map_cam,
-            view=candidate.view,
-            probability=likely,
-        )
+    def _pose_of_neighbour(self, keyframe_id: int, T_keyframe_cam: Matrix) -> Matrix | None:
+        with self._lock:
+            return self._map.pose_of_neighbour(keyframe_id, T_keyframe_cam)
 
 
 def _node_of(keyframe: Keyframe, span: Span | None) -> Node:
