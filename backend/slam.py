@@ -7,16 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from seamark.backend.chain import OdometryChains
 from seamark.backend.config import BackendConfig
-from seamark.backend.consistency import gate_chi2
 from seamark.backend.contraction import contract
 from seamark.backend.errors import BackendInputError
-from seamark.backend.evidence import Evidence, Gate
-from seamark.backend.graph_types import Constraint, Estimate, Matrix, Node, Solver, Span, check_nodes
-from seamark.backend.judge import PoseJudge
-from seamark.backend.judge_places import PlaceJudge
-from seamark.backend.ledger import Finding, Judge, Key, LoopLedger
+from seamark.backend.evidence import Evidence
+from seamark.backend.graph_types import Constraint, Estimate, Key, Matrix, Node, Solver, Span, check_nodes
+from seamark.backend.loop_verdicts import LoopVerdicts
 from seamark.backend.map_contraction import Contracted, Mean, contracted
 from seamark.backend.map_memory import KeyframeMemory, Load
 from seamark.backend.map_state import MapState, StoredPose
@@ -55,9 +51,8 @@ class Slam:
     ) -> None:
         if (mode == Mode.PLACES) != (solver is None):
             raise BackendInputError(f"mode {mode} needs {'no' if mode == Mode.PLACES else 'a'} solver")
-        self._config, self._solver = config, solver
-        self._chains = OdometryChains(config.drift)
-        self._ledger = LoopLedger(self._judge())
+        self._config, self._mode, self._solver = config, mode, solver
+        self._verdicts = LoopVerdicts(config, mode)
         self._map = MapState()
         self._unsolved = False
         self._memory = KeyframeMemory(config.map.memory_mb << 20, load)
@@ -153,17 +148,17 @@ class Slam:
                 self._loops[loop.query_id, loop.match_id] = loop
             if loop.accepted and (self._solver is None or loop.T_match_query is not None):
                 mean = self._means.get((loop.query_id, loop.match_id))
-                finding = self._finding_of(loop, None if mean is None else mean.scale_sigma)
-                self._ledger.restore(finding)
+                scale_sigma = None if mean is None else mean.scale_sigma
+                finding = self._verdicts.finding_of(loop, self._map.keyframes, scale_sigma)
+                self._verdicts.restore(finding)
                 accepted[finding.key] = finding.constraint
         if poses and self._solver is not None:
             self._map.revision = revision
             constraints = [constraint for constraint in accepted.values() if constraint is not None]
             self._solver.restore(nodes, constraints, self._map.estimate(), held=held)
             self._committed |= set(accepted)
-            self._unsolved = (
-                bool(accepted) and not held
-            )  # loops may have come after the last solution: the next keyframe asks
+            # Loops may have come after the last solution: the next keyframe asks.
+            self._unsolved = bool(accepted) and not held
             return
         for node in nodes:
             if self._solver is not None:
@@ -173,12 +168,12 @@ class Slam:
 
     def without(self, keyframe_ids: Collection[int]) -> Contracted:
         """Say what the map is without these keyframes; it becomes that when it is told to ``adopt`` it."""
-        nodes = self._chains.nodes()
+        nodes = self._verdicts.nodes()
         if self._solver is None:
             keyframes = self._map.keyframes.values()
             nothing = np.zeros((6, 6))
             nodes = tuple(Node(one.id, one.session, one.previous_id, np.eye(4), nothing) for one in keyframes)
-        found = (self._ledger.finding(key).constraint for key in sorted(self._committed))
+        found = (self._verdicts.constraint(key) for key in sorted(self._committed))
         constraints = [constraint for constraint in found if constraint is not None]
         counts = {key: mean.count for key, mean in self._means.items()}
         graph = contract(nodes, constraints, keyframe_ids, self._config.drift, counts)
@@ -192,23 +187,16 @@ class Slam:
             self._map.contract(change.graph.nodes, change.components)
         self._memory.forget(change.graph.gone)
         self._means = {key: mean for key, mean in self._means.items() if change.stays(key)} | change.means()
-        self._chains = OdometryChains(self._config.drift)
-        self._ledger = LoopLedger(self._judge())
+        self._verdicts = LoopVerdicts(self._config, self._mode, () if self._solver is None else change.graph.nodes)
         if self._solver is not None:
-            self._chains.extend(change.graph.nodes)
             self._solver.exchange(change.graph.nodes, list(change.graph.loops.values()), self._map.estimate())
         self._committed = {key for key in self._committed if change.stays(key)} | set(composed)
         for key in sorted(self._committed):
-            finding = self._finding_of(self._loops[key])
+            finding = self._verdicts.finding_of(self._loops[key], self._map.keyframes)
             if key in change.graph.loops:
                 finding = replace(finding, constraint=change.graph.loops[key])
-            self._ledger.restore(finding)
+            self._verdicts.restore(finding)
         self._unsolved = bool(change.graph.loops)
-
-    def _judge(self) -> Judge:
-        if self._solver is None:
-            return PlaceJudge(self._config.places, self._config.consistency)
-        return PoseJudge(self._chains, self._config.consistency)
 
     def locate(self, query: Keyframe, candidates: Candidates) -> tuple[Place, ...]:
         """Say where one image was taken: the verified candidates, localised ones first, then by inliers.
@@ -239,8 +227,7 @@ class Slam:
         if self._solver is not None:
             nodes = [_node_of(one, None if spans is None else spans.get(one.id)) for one in keyframes]
             check_nodes(nodes)
-            if nodes:
-                self._chains.extend(nodes)
+            self._verdicts.extend(nodes)
         with self._lock:
             for one in keyframes:
                 self._map.add(self._memory.add(one), None if poses is None else poses.get(one.id))
@@ -251,48 +238,15 @@ class Slam:
 
     def _enter(self, keyframe: Keyframe, candidate: Candidate, result: Verification | Rejected) -> list[Key]:
         """Write the loop's row with its verdict; return the rows that are new or changed."""
-        key = (keyframe.id, candidate.id)
-        self._evidence[key] = result.evidence
-        loop = Loop(
-            *key, False, Reason.UNCONFIRMED, result.inliers, candidate.score, candidate.votes, candidate.jeffrey
-        )
-        if isinstance(result, Rejected):
-            return self._write(replace(loop, reason=result.reason))
-        if self._solver is not None:
-            if result.T_match_query is None or result.covariance is None or not np.isfinite(result.scale_sigma):
-                return self._write(replace(loop, reason=Reason.BAD_GEOMETRY))
-            loop = replace(loop, T_match_query=result.T_match_query, covariance=result.covariance, scale=result.scale)
-        finding = self._finding_of(loop, result.scale_sigma)
-        if finding.constraint is not None and finding.query_session == finding.match_session:
-            chi2 = gate_chi2(finding.constraint, self._chains)
-            gate = Gate("odometry_chi2", chi2, self._config.consistency.gate_chi2, least=False)
-            if result.evidence is not None:
-                self._evidence[key] = replace(result.evidence, gates=(*result.evidence.gates, gate))
-            if not gate.passed:
-                return self._write(replace(loop, reason=Reason.ODOMETRY_DISAGREES))
-        keys = self._write(loop)
-        for changed_key, reason in self._ledger.add(finding).items():
-            changed = replace(self._loops[changed_key], accepted=reason == Reason.ACCEPTED, reason=reason)
-            keys += self._write(changed)
-        return keys
-
-    def _write(self, loop: Loop) -> list[Key]:
+        loop, verdicts = self._verdicts.enter(keyframe.id, candidate, result, self._map.keyframes)
         key = (loop.query_id, loop.match_id)
+        self._evidence[key] = loop.evidence
         with self._lock:
-            self._loops[key] = loop
-        return [key]
-
-    def _finding_of(self, loop: Loop, scale_sigma: float | None = None) -> Finding:
-        query, match = self._map.keyframes[loop.query_id], self._map.keyframes[loop.match_id]
-        constraint = None
-        if loop.T_match_query is not None and loop.covariance is not None:
-            known_scale = query.metric and match.metric
-            if scale_sigma is None:
-                scale_sigma = 1e-3 if known_scale else self._config.graph.unknown_scale_sigma
-            constraint = Constraint(
-                loop.query_id, loop.match_id, loop.T_match_query, loop.covariance, loop.scale, scale_sigma
-            )
-        return Finding(loop.query_id, loop.match_id, query.session, match.session, loop.inliers, constraint)
+            self._loops[key] = replace(loop, evidence=None)
+            for changed, reason in verdicts.items():
+                row = self._loops[changed]
+                self._loops[changed] = replace(row, accepted=reason == Reason.ACCEPTED, reason=reason)
+        return [key, *verdicts]
 
     def _commit(self, keys: list[Key]) -> bool:
         """Bring the graph in line with these loops' verdicts and have it solved; return whether it will be."""
@@ -306,7 +260,7 @@ class Slam:
                 self._map.revision += 1
             return False
         for key in keys:
-            constraint = self._ledger.finding(key).constraint
+            constraint = self._verdicts.constraint(key)
             if key in accepted and constraint is not None:
                 self._solver.add_loop(constraint)
             else:

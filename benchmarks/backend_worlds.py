@@ -24,7 +24,8 @@ from seamark.backend.config import BackendConfig
 from seamark.backend.pose_graph import PoseGraph
 from seamark.backend.slam import Slam
 from seamark.backend.types import Loop, MapSnapshot
-from seamark.backend.verify import Rejected, Verification
+from seamark.backend.verify import Verification
+from seamark.backend.verify_candidates import Verified
 from seamark.frontend import se3
 from seamark.frontend.types import Keyframe, Mode
 from seamark.vocab.types import Candidate, Candidates
@@ -34,7 +35,6 @@ FALSE_M, FALSE_DEG = 0.5, 10.0
 GROUP = 4  # injected loops that agree with each other
 
 Matrix = NDArray[np.float64]
-Verified = list[tuple[Candidate, Verification | Rejected]]
 
 
 @dataclass(frozen=True, eq=False)
