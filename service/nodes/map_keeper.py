@@ -111,7 +111,8 @@ class MapKeeper:
             retrying.join()
         with self._lock:
             try:
-                self._write_pending()
+                if not self._frozen:  # it would become the map's writer
+                    self._write_pending()
             except MapError as error:
                 logger.warning("%s; what is lost had not been acknowledged", error)
             self.store.close()
