@@ -234,11 +234,17 @@ def _usage(ended: tuple[ProcessUsage, ...], statuses: dict[str, Status]) -> tupl
 
 def _passed(odometry: tuple[Odometry, ...]) -> tuple[KeyframeSummary, ...]:
     """Return the keyframes of a run that leaves no map."""
-    return tuple(
-        KeyframeSummary(one.keyframe_id, one.session, one.index, one.stamp_ns, one.file)
-        for one in odometry
-        if one.keyframe_id is not None
-    )
+    files = {one.index: one.file for one in odometry}
+    passed = []
+    for one in odometry:
+        if one.filled:  # the first view of a mono session became a keyframe afterwards
+            first = one.filled[0]
+            passed.append(
+                KeyframeSummary(first.reference_id, first.session, first.index, first.stamp_ns, files[first.index])
+            )
+        if one.keyframe_id is not None:
+            passed.append(KeyframeSummary(one.keyframe_id, one.session, one.index, one.stamp_ns, one.file))
+    return tuple(passed)
 
 
 def _keyframes(map_path: Path, recorder: Recorder) -> tuple[KeyframeSummary, ...]:

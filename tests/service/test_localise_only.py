@@ -80,6 +80,22 @@ def test_a_run_that_only_localises_finds_its_frames_in_an_old_map(tmp_path: Path
     assert 0 < apart.max() < 0.05
 
 
+def test_a_mono_run_that_only_localises_knows_the_keyframe_that_a_session_began_with(tmp_path: Path) -> None:
+    """Test: the first view becomes a keyframe when the second one does. Expected: none is missing, and each is named."""
+    config = load_config(overrides=["frontend.keyframe_parallax_px=8", "service.record=false"])
+    runs = []
+    for name, way in (("old", {}), ("new", {"map_path": tmp_path / "old" / "map.seamark", "localise_only": True})):
+        options = RunOptions(tmp_path / name, ("toy",), in_process=True, **way)  # type: ignore[arg-type]
+        runs.append(run(toy_sequence("loop", 24, SEED, Mode.MONO), options, config))
+    first, second = runs
+    count = len(first.keyframes)
+    assert [one.id for one in second.keyframes] == [one.id + count for one in first.keyframes]
+    assert [(one.index, one.stamp_ns, one.file) for one in second.keyframes] == [
+        (one.index, one.stamp_ns, one.file) for one in first.keyframes
+    ]
+    assert count > 3
+
+
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     return {one.name: (one.read_bytes(), one.stat().st_mtime_ns) for one in folder.iterdir()}
 
