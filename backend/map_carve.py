@@ -78,7 +78,7 @@ def _row_of(table: str, number: int, values: tuple[Any, ...]) -> tuple[Any, ...]
 def _free_pages(content: mmap.mmap, size: int) -> set[int]:
     """Return the numbers of the pages in the list of free ones, as far as it can be followed."""
     found: set[int] = set()
-    if bytes(content[:16]) != HEADER:
+    if len(content) < 36 or bytes(content[:16]) != HEADER:
         return found
     (trunk,) = struct.unpack(">I", content[32:36])
     while trunk and trunk not in found and trunk * size <= len(content):

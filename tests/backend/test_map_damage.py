@@ -185,6 +185,15 @@ def test_a_lost_page_of_keyframes_is_bridged(whole: Path, tmp_path: Path) -> Non
         np.testing.assert_allclose(np.diag(nodes[12].covariance), 3 * np.diag(nodes[13].covariance))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("size", [15, 17, 20, 33, 35, 99, 107, 108])
+def test_of_a_map_cut_off_in_its_header_nothing_can_be_saved(size: int, whole: Path, tmp_path: Path) -> None:
+    path = tmp_path / "short.seamark"
+    path.write_bytes(whole.read_bytes()[:size])
+    with pytest.raises(MapError, match="nothing could be saved"):
+        repair_map(path, tmp_path / "new.seamark")
+    assert list(tmp_path.glob("new*")) == []
+
+
 def test_nothing_to_save_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "map.seamark"
     path.write_bytes(bytes(10 * PAGE))
