@@ -158,9 +158,7 @@ def test_a_frozen_keeper_writes_nothing(tmp_path: Path) -> None:
     assert path.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["map.seamark"]
 
 
-def test_a_frozen_keeper_that_closes_never_becomes_the_writer(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_frozen_keeper_that_closes_never_becomes_the_writer(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Test: two services localise in one map, which is taken away. Expected: both end silently and make no new one."""
     path = tmp_path / "map.seamark"
     with MapStore(path) as store:
