@@ -29,10 +29,10 @@ def track(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Follow points (N, 2) from one image to another, starting at ``guess`` (N, 2) if given.
 
-    Returns the points (N, 2) float32 in ``after`` and which of them survive: found within ``reach_px`` of their start,
-    inside the image, back within
-    ``round_trip_px`` of where they came from when tracked backward, and with a patch whose zero-mean normalised
-    correlation with the one it came from is at least ``min_correlation``.
+    Returns the points (N, 2) float32 in ``after`` and which of them survive: found, moved on no level of the pyramid by
+    more than ``reach_px``, inside the image, back within ``round_trip_px`` of where they came from when tracked
+    backward, and with a patch whose zero-mean normalised correlation with the one it came from is at least
+    ``min_correlation``.
     """
     start = np.ascontiguousarray(points, np.float32)
     first = start if guess is None else np.ascontiguousarray(guess, np.float32)

@@ -254,7 +254,10 @@ class Launcher:
             if self._stopping:
                 return
             self.restarts[child.name] += 1
-            self._start(child.name, self._settings)
+            try:
+                self._start(child.name, self._settings)
+            except OSError as error:  # no memory, no process left: nobody would notice that the node stays away
+                self._failure = NodeFailedError(f"{sentence}; it cannot be started again: {error}")
 
     def _counting_on(self, margin: int = 0) -> None:
         """Let the next front end go on counting after all keyframes that the last one has sent.

@@ -1,5 +1,6 @@
 """Node processes come alive, are replaced when they die, say why they cannot start, and stop in order."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -134,6 +135,19 @@ def test_crashes_far_apart_are_none_too_many(tmp_path: Path, monkeypatch: pytest
             wait_until(lambda count=count: launcher.restarts[VOCAB] == count)  # type: ignore[misc]
             launcher.wait_until_alive()
         launcher.check()
+
+
+def test_a_node_that_cannot_be_started_again_ends_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test: a node crashes when the system has no room for another process. Expected: the service says so."""
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    with launch(tmp_path) as launcher:
+        monkeypatch.setattr(launcher_module.subprocess, "Popen", refused)
+        os.kill(launcher.process_id(VOCAB), signal.SIGKILL)
+        with pytest.raises(NodeFailedError, match=r"the vocab node has ended.*cannot be started again"):
+            wait_until(lambda: launcher.check())  # type: ignore[func-returns-value]
 
 
 def test_a_node_that_does_not_stop_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
