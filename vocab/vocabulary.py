@@ -141,7 +141,7 @@ class Vocabulary:
 
     @classmethod
     def default(cls) -> "Vocabulary":
-        """Return the vocabulary that ships, trained on generated images by benchmarks/train_default_vocabulary.py.
+        """Return the vocabulary that ships; benchmarks/train_default_vocabulary.py trained it, on no photograph.
 
         Raises:
             VocabularyFileError: the installation is damaged.
