@@ -56,7 +56,7 @@ def write_files(record: RunRecord, folder: Path, config: SeamarkConfig) -> None:
         (folder / "keyframes.tum").write_text(tum_text(trajectories.keyframes(record)), encoding="utf-8")
         rows = (frame_row(frame, timed=not record.deterministic) for frame in record.odometry)
         _write_csv(folder / "frames.csv", FRAME_COLUMNS, rows)
-        by_id = {keyframe.id: keyframe for keyframe in record.keyframes}
+        by_id = {keyframe.id: keyframe for keyframe in (*record.known, *record.keyframes)}
         _write_csv(folder / "loops.csv", LOOP_COLUMNS, (loop_row(loop, by_id) for loop in record.snapshot.loops))
         (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
         text = json.dumps(report, indent=2, allow_nan=False, ensure_ascii=False)

@@ -123,6 +123,7 @@ def _run_nodes(
             wall_s=wall_s,
             stages_ms=_stages(statuses),
             deterministic=options.in_process,
+            known=_known(options.map_path) if options.localise_only and options.map_path is not None else (),
         )
         recorder.finish(record)
     return record
@@ -245,6 +246,12 @@ def _passed(odometry: tuple[Odometry, ...]) -> tuple[KeyframeSummary, ...]:
         if one.keyframe_id is not None:
             passed.append(KeyframeSummary(one.keyframe_id, one.session, one.index, one.stamp_ns, one.file))
     return tuple(passed)
+
+
+def _known(map_path: Path) -> tuple[KeyframeSummary, ...]:
+    """Return the keyframes of a map, which is left as it is."""
+    with MapStore(map_path, read_only=True) as store:
+        return tuple(KeyframeSummary(k.id, k.session, k.index, k.stamp_ns, k.file) for k in store.load_nodes())
 
 
 def _keyframes(map_path: Path, recorder: Recorder) -> tuple[KeyframeSummary, ...]:

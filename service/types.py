@@ -49,6 +49,7 @@ class RunRecord:
     the map after the last optimisation. ``ground_truth`` is of cam0, or None. ``stages_ms`` maps a stage of the work to
     all its latencies in ms (frontend stages, verification, optimisation...). ``wall_s`` is from the first frame sent to
     all nodes drained. ``deterministic`` says that two such runs must give equal files: wall times are left out of them.
+    ``known`` are keyframes of a map that the run has localised itself in and left as it was.
     """
 
     sources: tuple[str, ...]
@@ -61,3 +62,4 @@ class RunRecord:
     wall_s: float
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
     deterministic: bool = False
+    known: tuple[KeyframeSummary, ...] = ()

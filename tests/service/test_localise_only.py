@@ -1,5 +1,6 @@
 """Localisation only: the service answers from the map and leaves it as it is, to the byte."""
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,6 +95,10 @@ def test_a_mono_run_that_only_localises_knows_the_keyframe_that_a_session_began_
         (one.index, one.stamp_ns, one.file) for one in first.keyframes
     ]
     assert count >= 2
+    names = {one.file for one in first.keyframes}
+    with (tmp_path / "new" / "loops.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["query_file"] in names]
+    assert rows and all(row["match_file"] in names and float(row["match_stamp"]) > 0 for row in rows)
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
