@@ -150,12 +150,12 @@ def main() -> None:
     pairs = [(sets[a], sets[b], True) for a, b in PAIRS]
     pairs += [(sets[a], Set(f"{b}, worse", sets[b].worse, sets[b].poses, []), True) for a, b in PAIRS]
     pairs.append((*generated(options.images), False))
-    for alone in (True, False):
-        calibrate(pairs, alone=alone)
+    for together in (False, True):
+        calibrate(pairs, together=together)
 
 
-def calibrate(pairs: Sequence[tuple[Set, Set, bool]], *, alone: bool) -> None:
-    """Print the weights for scores of the place index (alone), or without what the images of each set share."""
+def calibrate(pairs: Sequence[tuple[Set, Set, bool]], *, together: bool) -> None:
+    """Print the weights for scores of the place index, or (together) without what the images of each set share."""
     vocabulary, config = Vocabulary.default(), VocabConfig()
     singles, ways = [], []
     for database, queries, ordered in pairs:
@@ -163,7 +163,7 @@ def calibrate(pairs: Sequence[tuple[Set, Set, bool]], *, alone: bool) -> None:
         for in_order, found in ((False, singles), (True, ways)):
             if in_order and not ordered:
                 continue
-            arguments = {"top": 1, "in_order": in_order, "workers": 1, "alone": alone}
+            arguments = {"top": 1, "in_order": in_order, "workers": 1, "together": together}
             answers = search(database.images, queries.images, vocabulary, config, **arguments)  # type: ignore[arg-type]
             part = list(correctness(database, queries, answers, one_world=one_world))
             found += part
@@ -174,7 +174,7 @@ def calibrate(pairs: Sequence[tuple[Set, Set, bool]], *, alone: bool) -> None:
                 f"median score right/wrong {'/'.join(scores)}, most inliers of a wrong one {most}",
                 flush=True,
             )
-    name = "AS_THEY_ARE" if alone else "TRAVERSALS"
+    name = "TRAVERSALS" if together else "AS_THEY_ARE"
     right = np.array([r for _, r in singles])
     x = np.array([(a.evidence, np.log1p(a.matches[0].inliers)) for a, _ in singles])
     describe_fit(f"{name}, single", fit(x, right), x, right)

@@ -144,28 +144,28 @@ def main() -> None:
     for name in ("votes", "votes + histograms + view (default)"):
         weights = CUES[name]
         matrix(f"{name}, islands", lambda weights=weights: by_islands(by_cues(database, queries, vocabulary, weights)))
-    for by, in_order, alone in product((None, motion) if motion else (None,), (False, True), (True, False)):
-        if own and alone:
+    for by, in_order, together in product((None, motion) if motion else (None,), (False, True), (False, True)):
+        if own and together:
             continue
         start = time.process_time()
         arguments = {"top": 20, "in_order": in_order, "workers": 1}
         if own:
             answers, _ = search_own(database, stamps, vocabulary, settings, **arguments, motion=by)
         else:
-            answers = search(database, queries, vocabulary, VocabConfig(), **arguments, alone=alone)
+            answers = search(database, queries, vocabulary, VocabConfig(), **arguments, together=together)
         ms = 1e3 * (time.process_time() - start) / len(queries)
         answers = [answers[row] for row in rows]
         places = [[match.place for match in answer.matches] for answer in answers]
         name = (
             ("in order" if in_order else "verification of 20")
             + (", odometry" if by else "")
-            + (", alone" if alone else "")
+            + (", together" if together else "")
         )
         if not in_order and not by:
             report(name, places, np.array([answer.evidence for answer in answers]), truth[rows], ms)
             name += ", less doubt (places match)"
         report(name, places, np.array([answer.matches[0].score for answer in answers]), truth[rows], ms)
-        if not in_order and by is motion and not alone:
+        if not in_order and by is motion and not together:
             singly = answers
         right = [truth[row, a.matches[0].place] for row, a in zip(rows, answers, strict=True) if a.matches[0].accepted]
         print(f"| accepted | {sum(right)} right, {len(right) - sum(right)} wrong |")

@@ -116,8 +116,9 @@ def report(
     for cue in ("votes", "histograms", "view"):
         scores = by_cues(database, queries, vocabulary, CUES[cue])
         row.append(recall(np.argsort(-scores, axis=1, kind="stable")[:, :20].tolist(), truth))
-    for in_order, alone in ((False, True), (False, False), (True, False)):
-        found = search(database, queries, vocabulary, VocabConfig(), top=20, in_order=in_order, workers=1, alone=alone)
+    for in_order, together in ((False, False), (False, True), (True, True)):
+        settings = {"top": 20, "in_order": in_order, "workers": 1, "together": together}
+        found = search(database, queries, vocabulary, VocabConfig(), **settings)  # type: ignore[arg-type]
         first = np.array([truth[i, answer.matches[0].place] for i, answer in enumerate(found)])
         sure = np.array([answer.matches[0].accepted for answer in found])
         row.append(recall([[match.place for match in answer.matches] for answer in found], truth))
@@ -137,7 +138,7 @@ def main() -> None:
     vocabulary, config = Vocabulary.default(), FrontendConfig()
     database = [describe_image(read_image(path), path.name, config) for path in list_images(options.day)]
     print(
-        "| night | votes | histograms | view | alone | right, wrong | default | right, wrong | order | right, wrong |"
+        "| night | votes | histograms | view | singly | right, wrong | together | right, wrong | order | right, wrong |"
     )
     print("|---" * 10 + "|")
     for model in options.models:

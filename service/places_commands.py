@@ -14,9 +14,9 @@ VocabOption = Annotated[Path | None, typer.Option("--vocab", help="Vocabulary fi
 SequenceOption = Annotated[
     bool, typer.Option("--sequence", help="Both sets are in the order in which they were taken: use it.")
 ]
-AloneOption = Annotated[
+TogetherOption = Annotated[
     bool,
-    typer.Option("--alone", help="Each query by itself: do not leave out what all images of a folder have in common."),
+    typer.Option("--together", help="Leave out what all images of a folder have in common; --sequence does so too."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 OverrideOption = Annotated[list[str] | None, typer.Option("-o", metavar="KEY=VALUE", help="Set section.key=value.")]
@@ -34,7 +34,7 @@ def match_command(
     out: Annotated[Path, typer.Option("--out", help="The table to write (CSV).")],
     top: Annotated[int, typer.Option("--top", min=1, help="Rows per query.")] = 20,
     sequence: SequenceOption = False,
-    alone: AloneOption = False,
+    together: TogetherOption = False,
     vocab: VocabOption = None,
     workers: WorkersOption = None,
     override: OverrideOption = None,
@@ -46,7 +46,7 @@ def match_command(
     from seamark.service.places_images import available_workers
 
     config = load_config(None, os.environ, override or [])
-    options = places_match.MatchOptions(database, queries, out, top, sequence, vocab, alone)
+    options = places_match.MatchOptions(database, queries, out, top, sequence, vocab, together)
     with Bar("describing") as bar:
         summary = places_match.match_folders(options, config, workers or available_workers(), _warn, bar.count)
     if as_json:
@@ -61,7 +61,7 @@ def eval_command(
     out: Annotated[Path, typer.Option("--out", help="Folder for the results.")],
     against: Annotated[str | None, typer.Option("--against", help="A second traversal that asks.")] = None,
     sequence: SequenceOption = False,
-    alone: AloneOption = False,
+    together: TogetherOption = False,
     distance: Annotated[float, typer.Option("--distance", min=0, help="One place: true poses nearer, in m.")] = 3.0,
     angle: Annotated[float, typer.Option("--angle", min=0, help="One place: directions nearer, in degrees.")] = 45.0,
     tolerance: Annotated[int, typer.Option("--tolerance", min=0, help="One place, without poses: images apart.")] = 3,
@@ -78,7 +78,7 @@ def eval_command(
     from seamark.service.sources.open import open_sources
 
     config = load_config(None, os.environ, override or [])
-    options = places_eval.EvalOptions(out, sequence, vocab, distance, angle, tolerance, precision, alone)
+    options = places_eval.EvalOptions(out, sequence, vocab, distance, angle, tolerance, precision, together)
     first = open_sources([source], mode=None if against is None else "places")  # in its own past odometry is asked
     second = None if against is None else open_sources([against], mode="places")
     with Bar("describing") as bar:

@@ -37,7 +37,7 @@ class EvalOptions:
 
     Images show the same place when their true poses are within ``distance_m`` and ``angle_deg``; where poses are
     unknown, image i of one traversal shows the place of image i of the other, ``tolerance_images`` more or less. With
-    ``alone`` the answer to an image of a second traversal depends on no other image of it.
+    ``together`` or ``in_order`` the images of a second traversal are compared without what all have in common.
     """
 
     out: Path
@@ -47,7 +47,7 @@ class EvalOptions:
     angle_deg: float = 45.0
     tolerance_images: int = 3
     precision: float = 0.95
-    alone: bool = False
+    together: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,9 @@ def evaluate_places(
             answers, eligible = search_own(database, stamps.tolist(), vocabulary, settings, **arguments, motion=motion)
             same = same & eligible
         else:
-            answers = search(database, queries, vocabulary, config.vocab, **arguments, alone=options.alone)
+            answers = search(
+                database, queries, vocabulary, config.vocab, **arguments, together=options.together or options.in_order
+            )
         evaluation = Evaluation(answers, same, judged, said)
         report = build_report(evaluation, options)
         report |= {"source": source.name, "against": against.name if against else None, "words": vocabulary.n_words}

@@ -26,7 +26,8 @@ NAMED_IN_WARNING = 3
 class MatchOptions:
     """What was asked for; ``vocabulary`` None means the one that ships, ``in_order`` that order is evidence.
 
-    With ``alone`` the answer to a query depends on no other query.
+    With ``together`` or ``in_order`` images are compared without what all of a folder have in common; with neither the
+    answer to a query depends on no other query.
     """
 
     database: Path
@@ -35,7 +36,7 @@ class MatchOptions:
     top: int = 20
     in_order: bool = False
     vocabulary: Path | None = None
-    alone: bool = False
+    together: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def match_folders(
         top=options.top,
         in_order=options.in_order,
         workers=workers,
-        alone=options.alone,
+        together=options.together or options.in_order,
     )
     rows = matches_table(database, queries, answers)
     write_table(options.out, rows)

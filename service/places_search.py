@@ -79,13 +79,12 @@ def search(
     top: int,
     in_order: bool,
     workers: int,
-    alone: bool = False,
+    together: bool = False,
 ) -> list[Answer]:
     """Answer every query with ``top`` places, fewer only where the database is smaller.
 
-    ``in_order`` says that both were taken along a way, and lets neighbours count. Otherwise no order is used, but what
-    all images of either set have in common is left out of the comparison; with ``alone`` not even that is done, and the
-    answer to a query does not depend on the others.
+    ``in_order`` says that both were taken along a way, and lets neighbours count. With ``together`` what all images of
+    either set have in common is left out of the comparison. With neither the answer to a query depends on no other.
     """
     index = PlaceIndex(vocabulary, config)
     for number, image in enumerate(database):
@@ -93,9 +92,9 @@ def search(
     table = _empty_table(len(queries), len(database))
     for row, query in enumerate(queries):
         _fill(table, row, index.query(query.observation(QUERY_ID, QUERY_SESSION), len(database)).ranked)
-    if not alone and len(queries) and len(database):
+    if together and len(queries) and len(database):
         table = replace(table, score=_score_traversals(table, database, queries, config))
-    calibration = confidence.AS_THEY_ARE if alone else confidence.TRAVERSALS
+    calibration = confidence.TRAVERSALS if together else confidence.AS_THEY_ARE
     return _answers(table, database, queries, top, in_order, workers, calibration)
 
 

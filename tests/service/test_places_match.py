@@ -103,7 +103,7 @@ def test_views_from_elsewhere_find_their_place(folders: tuple[Path, Path], tmp_p
         assert int(best[f"q{number}"]["inliers"]) < 8
 
 
-def test_the_order_of_files_never_matters_and_alone_no_other_query_does(
+def test_the_order_of_files_never_matters_nor_another_query_unless_together(
     folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """Test: the same queries under names in reverse order, and a single one. Expected: the same rows for each."""
@@ -116,19 +116,18 @@ def test_the_order_of_files_never_matters_and_alone_no_other_query_does(
         (reverse / other).write_bytes((folders[1] / name).read_bytes())
     (single / names[0]).write_bytes((folders[1] / names[0]).read_bytes())
 
-    def answers(queries: Path, *, alone: bool) -> dict[str, list[tuple[str, str]]]:
-        rows, _ = run((folders[0], queries), tmp_path / "m.csv", alone=alone)
+    def answers(queries: Path, *, together: bool) -> dict[str, list[tuple[str, str]]]:
+        rows, _ = run((folders[0], queries), tmp_path / "m.csv", together=together)
         found: dict[str, list[tuple[str, str]]] = {}
         for row in rows:
             found.setdefault(row["query"], []).append((row["match"], row["score"]))
         return found
 
-    together = answers(folders[1], alone=False)
-    turned = answers(reverse, alone=False)
-    assert {name: turned[other] for name, other in renamed.items()} == together
-    one = answers(single, alone=True)
-    assert one[names[0]] == answers(folders[1], alone=True)[names[0]]
-    assert answers(single, alone=False)[names[0]] != together[names[0]]
+    common = answers(folders[1], together=True)
+    turned = answers(reverse, together=True)
+    assert {name: turned[other] for name, other in renamed.items()} == common
+    assert answers(single, together=False)[names[0]] == answers(folders[1], together=False)[names[0]]
+    assert answers(single, together=True)[names[0]] != common[names[0]]
 
 
 def test_a_small_database_gives_all_it_has(folders: tuple[Path, Path], tmp_path: Path) -> None:
