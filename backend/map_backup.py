@@ -1,9 +1,9 @@
 """A copy of a map, also of one that a service is writing."""
 
-import os
 from pathlib import Path
 
 from seamark.backend.errors import MapError
+from seamark.backend.map_file import sync_to_disk
 from seamark.backend.map_store import MapStore
 
 
@@ -20,9 +20,9 @@ def back_up_map(path: Path, out: Path) -> int:
         _remove(partial)  # of a backup that was killed: it may be no database
         with MapStore(path, read_only=True) as store:
             store.copy(partial)
-        _sync(partial)
+        sync_to_disk(partial)
         partial.rename(out)
-        _sync(out.absolute().parent)
+        sync_to_disk(out.absolute().parent)
         return out.stat().st_size
     except OSError as error:
         raise MapError(f"{out} cannot be written: {error.strerror}") from error
@@ -33,11 +33,3 @@ def back_up_map(path: Path, out: Path) -> int:
 def _remove(path: Path) -> None:
     for one in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))):
         one.unlink(missing_ok=True)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

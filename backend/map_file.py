@@ -193,7 +193,7 @@ class MapFile:
                     migrate(database, version)
                 database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         if new:
-            _sync_folder(self.path.absolute().parent)
+            sync_to_disk(self.path.absolute().parent)
 
 
 def _is_full(folder: Path) -> bool:
@@ -208,9 +208,9 @@ def _has_content(path: Path) -> bool:
     return path.exists() and path.stat().st_size > 0
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make the entry of a new file durable: SQLite does it for its journals only."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync_to_disk(path: Path) -> None:
+    """Make a file durable, or the entries of a folder: of a new file SQLite sees to those of its journals only."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

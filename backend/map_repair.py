@@ -1,6 +1,5 @@
 """What is whole in a damaged map, in a new file."""
 
-import os
 import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing
@@ -11,7 +10,7 @@ from typing import Any, Final
 from seamark.backend.errors import MapCorruptError, MapError
 from seamark.backend.map_carve import carve
 from seamark.backend.map_codec import checksum, decode_array, encode_array, motion_between, row_name, sealed
-from seamark.backend.map_file import MapFile
+from seamark.backend.map_file import MapFile, sync_to_disk
 from seamark.backend.map_migrations import V1_COLUMNS, checksum_v1, convert_v1
 from seamark.backend.map_schema import COLUMNS, KEYS, select, upsert
 
@@ -60,9 +59,9 @@ def repair_map(path: Path, out: Path) -> RepairReport:
                     report.saved[table] = database.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
         if broken or not report.saved["keyframes"]:
             raise MapError(f"nothing could be saved of {path}")
-        _sync(partial)
+        sync_to_disk(partial)
         partial.rename(out)
-        _sync(out.absolute().parent)
+        sync_to_disk(out.absolute().parent)
     finally:
         for leftover in (partial, *(partial.with_name(partial.name + end) for end in ("-wal", "-shm"))):
             leftover.unlink(missing_ok=True)
@@ -248,11 +247,3 @@ def _bridge(
 
 def _listed(things: list[Any]) -> str:
     return ", ".join(map(str, things[:20])) + (f" and {len(things) - 20} more" if len(things) > 20 else "")
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -13,7 +13,7 @@ struct FlowSettings {
     int top, back_top;  // highest levels on the way there and back
     bool level_out;     // whether the mean of each patch is taken off
     float least_likeness;  // of a patch that is followed back
-    float reach;           // how far from its start a patch may be found, in pixels
+    float reach;           // how far a patch may move on each level, in pixels of the image
 };
 
 // Moves `there` (n, 2) in `after` from where it is to where the patch of `before` around `points` (n, 2) is seen.
