@@ -1,8 +1,9 @@
 """The map on disk: one SQLite file that survives ``kill -9`` at any moment."""
 
 import sqlite3
+import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,7 @@ class MapStore:
     ) -> None:
         self.path = path
         self.file = MapFile(path, read_only, beside_writer, existing)
+        self._opening = threading.RLock()  # held while the file is read, and while it is opened anew
         self._cameras: dict[int, Camera] = {}
         self._written: dict[int, tuple[NDArray[np.float64], float]] = {}  # poses as they are in the file
 
@@ -83,13 +85,17 @@ class MapStore:
         self.close()
 
     def take_over(self) -> None:
-        """Become the writer of a map that was opened read-only; raises MapError, and goes on reading, if that fails."""
-        self.file.close()
-        try:
-            self.file = MapFile(self.path)
-        except MapError:
-            self.file = MapFile(self.path, read_only=True)
-            raise
+        """Become the writer of a map that was opened read-only; raises MapError, and goes on reading, if that fails.
+
+        Other threads that read meanwhile wait.
+        """
+        with self._opening:
+            self.file.close()
+            try:
+                self.file = MapFile(self.path)
+            except MapError:
+                self.file = MapFile(self.path, read_only=True)
+                raise
 
     def set_meta(self, values: Mapping[str, str]) -> None:
         """Write facts about the whole map: mode, vocabulary hash, config hash, version that created it, revision."""
@@ -176,7 +182,7 @@ class MapStore:
     def keyframe_ids(self, recognisable: bool = False) -> list[int]:
         """Return the ids of all keyframes, or of those that have features, ascending."""
         table, column = ("views", "keyframe_id") if recognisable else ("keyframes", "id")
-        with self.file.reading() as database:
+        with self._reading() as database:
             return [row[0] for row in database.execute(f"SELECT {column} FROM {table} ORDER BY 1")]
 
     def load_keyframes(self) -> Iterator[Keyframe]:
@@ -251,12 +257,12 @@ class MapStore:
 
     def session_of_keyframes(self) -> dict[int, int]:
         """Return the session of each keyframe."""
-        with self.file.reading() as database:
+        with self._reading() as database:
             return dict(map(tuple, database.execute("SELECT id, session FROM keyframes")))
 
     def bytes_used(self) -> int:
         """Return how many bytes of the file hold something: free pages are used again before it grows."""
-        with self.file.reading() as database:
+        with self._reading() as database:
             names = ("page_count", "freelist_count", "page_size")
             count, free, size = (database.execute(f"PRAGMA {name}").fetchone()[0] for name in names)
         return int((count - free) * size)
@@ -279,8 +285,13 @@ class MapStore:
         """Make the map one file and close it; harmless when repeated."""
         self.file.close()
 
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection]:
+        with self._opening, self.file.reading() as database:
+            yield database
+
     def _rows(self, table: str, condition: str = "", values: tuple[Any, ...] = ()) -> list[sqlite3.Row]:
-        with self.file.reading() as database:
+        with self._reading() as database:
             rows = database.execute(select(table, condition), values).fetchall()
         for row in rows:
             check_row(table, row)

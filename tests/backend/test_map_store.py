@@ -2,11 +2,14 @@
 
 import os
 import sqlite3
+import threading
+import time
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from seamark.backend import map_file
 from seamark.backend.errors import MapCorruptError, MapError, MapInUseError, MapVersionError
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
@@ -125,6 +128,34 @@ def test_a_full_disk_is_an_error_and_keeps_what_was_there(tmp_path, keyframe):
         assert_same(keyframe(0), store.keyframe(0))
     with MapStore(path, read_only=True) as store:
         assert_same(keyframe(0), next(iter(store.load_keyframes())))
+
+
+def test_nobody_reads_a_closed_file_while_a_reader_tries_to_become_the_writer(tmp_path, keyframe, monkeypatch):
+    """Test: another reader is in the way, so that it fails, while a thread reads. Expected: each reading succeeds."""
+    monkeypatch.setattr(map_file, "READERS_PATIENCE_S", 0.1)
+    path = tmp_path / "map.seamark"
+    with MapStore(path) as store:
+        store.add_keyframe(keyframe(0))
+    read, ended = [], threading.Event()
+    with MapStore(path, read_only=True) as store, MapStore(path, read_only=True):
+
+        def read_on():
+            while not ended.is_set():
+                try:
+                    read.append(len(store.keyframe(0).features))
+                except MapError as error:
+                    read.append(error)
+
+        thread = threading.Thread(target=read_on)
+        thread.start()
+        for _ in range(3):
+            with pytest.raises(MapInUseError):
+                store.take_over()
+            time.sleep(0.02)
+        ended.set()
+        thread.join()
+    assert len(read) > 3
+    assert set(read) == {len(keyframe(0).features)}
 
 
 def test_a_reader_beside_the_writer_keeps_nobody_out_and_sees_what_is_written(tmp_path, keyframe):

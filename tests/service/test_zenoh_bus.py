@@ -401,16 +401,18 @@ def test_closing_ends_a_handler_that_waits_for_a_reply_or_for_its_own_messages(n
 
 
 def test_a_node_that_dies_takes_its_requests_with_it(net: Net) -> None:
-    a, b, hold, seen = net.bus("a"), net.bus("b"), threading.Event(), []
+    a, b, asked, hold, seen = net.bus("a"), net.bus("b"), threading.Event(), threading.Event(), []
     token = announce(b._session, "x", "b")
     watch = Watch(net.router, "x")
     watch.wait_for(["b"], PATIENCE_S)
     wait_until(lambda: a._watch.alive == {"b"})
-    b.handle(ASK, lambda m: (hold.wait(PATIENCE_S), Done("b"))[1])
+    b.handle(ASK, lambda m: (asked.set(), hold.wait(PATIENCE_S), Done("b"))[2])
     b.handle(ACKED, lambda m: (seen.append(m.query_id), None)[1])
     wait_until(lambda: a.matched(ASK))
     future = a.request_async(ASK, message(0), PATIENCE_S)
+    assert asked.wait(PATIENCE_S)  # nothing that comes later is handled now
     a.send(ACKED, message(0))
+    wait_until(lambda: [outbox._in_flight for outbox in a._outboxes.values()] == [1])
     token.undeclare()  # the queries themselves stay open, as when their end was lost
     assert isinstance(future.exception(PATIENCE_S / 2), UnavailableError)
     wait_until(lambda: a.resent >= 1)
