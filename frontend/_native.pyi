@@ -32,8 +32,18 @@ def follow(
 def strongest(
     image: NDArray[np.uint8], cell: int, border: int, harris_k: float, mask: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]: ...
+
+class RightOfWay:
+    def __init__(self) -> None: ...
+    def take(self) -> None: ...
+    def give_back(self) -> None: ...
+
 def sift(
-    image: NDArray[np.uint8], mask: NDArray[np.uint8] | None, most: int, contrast: float
+    image: NDArray[np.uint8],
+    mask: NDArray[np.uint8] | None,
+    most: int,
+    contrast: float,
+    way: RightOfWay | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]: ...
 def median_difference(image: NDArray[np.uint8]) -> float: ...
 def apart(

@@ -31,11 +31,12 @@ def extract_features(
     contrast: float = 0.015,
     mask: NDArray[np.uint8] | None = None,
     max_pixels: int | None = None,
+    way: native.RightOfWay | None = None,
 ) -> Features:
     """Find at most ``n_features`` SIFT key points (Lowe 2004) in a grey or BGR uint8 image, strongest first.
 
     None is taken where ``mask`` (H, W) uint8 is zero. An image of more than ``max_pixels`` is reduced to so many first;
-    points and scales are those of the whole image all the same.
+    points and scales are those of the whole image all the same. Who takes ``way`` meanwhile is let pass.
     """
     grey, scale = grey_of(image), 1.0
     if max_pixels is not None and grey.size > max_pixels:
@@ -44,7 +45,7 @@ def extract_features(
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         mask = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
     mask = None if mask is None else np.ascontiguousarray(mask, np.uint8)
-    table, descriptors = native.sift(np.ascontiguousarray(grey), mask, n_features, GREY_LEVELS * contrast)
+    table, descriptors = native.sift(np.ascontiguousarray(grey), mask, n_features, GREY_LEVELS * contrast, way)
     whole = np.array(image.shape[1::-1]) / np.array(grey.shape[1::-1])
     table[:, :2] = (table[:, :2] + 0.5) * whole - 0.5
     table[:, 2] /= scale

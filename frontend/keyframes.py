@@ -1,17 +1,14 @@
 """What a keyframe carries beyond its pose: SIFT, landmarks, JPEG, thumbnail; made in a thread beside tracking.
 
 SIFT costs as much as three frames of tracking and frees the interpreter while it works, so one plain thread keeps it
-off the frame's latency, and gives way where there is one core only. Keyframes come out in the order they went in;
-nothing that the tracker decides depends on when.
+off the frame's latency. While a frame is tracked its kernel stands still, as long as it keeps up: a pose is waited
+for, key points are not. Keyframes come out in the order they went in; nothing that the tracker decides depends on when.
 """
 
-import contextlib
-import os
-import sys
-import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import cv2
@@ -24,11 +21,12 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.depth import DepthSensor
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import extract_features, match_descriptors, thumbnail_of
+from seamark.frontend.kernels import native
 from seamark.frontend.two_view import triangulate
 from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
 MAX_PENDING = 8
-NICENESS = 10  # a tenth of tracking's share of a core that both want
+UNHURRIED = 4  # with more under way the thread has fallen behind, and gives way no longer
 TRIANGULATION_PX = 2.0
 NO_OFFSET = DepthOffset.expected(0.0)
 RELATIVE_SIGMA = 0.2  # a landmark whose depth is less sure than this is not worth keeping
@@ -47,20 +45,13 @@ class KeyframeRequest:
     depth_offset: DepthOffset
 
 
-def _give_way() -> None:
-    """Let tracking go first where there is one core for both: what this thread makes can wait, a pose cannot."""
-    if sys.platform == "linux":  # elsewhere it would be the whole process that gives way
-        with contextlib.suppress(OSError):  # a sandbox may forbid it, and then all goes on as on other systems
-            niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
-
-
 class KeyframeBuilder:
     """Turns requests into keyframes, in order, in one thread."""
 
     def __init__(self, rig: Rig | None, mode: Mode, config: FrontendConfig, sensor: DepthSensor) -> None:
         self._rig, self._mode, self._config, self._sensor = rig, mode, config, sensor
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=_give_way)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
+        self._way = native.RightOfWay()
         self._pending: deque[Future[list[Keyframe]]] = deque()
         self._ready: list[Keyframe] = []
         self._recent: deque[Keyframe] = deque(maxlen=config.recovery_keyframes)
@@ -90,6 +81,16 @@ class KeyframeBuilder:
             self._collect()
         self._pending.append(self._pool.submit(self._make_all, list(requests)))
 
+    @contextmanager
+    def tracking(self) -> Iterator[None]:
+        """Have the right of way over the thread, unless it has fallen behind."""
+        if sum(not made.done() for made in self._pending) <= UNHURRIED:
+            self._way.take()
+        try:
+            yield
+        finally:
+            self._way.give_back()
+
     def take(self) -> tuple[Keyframe, ...]:
         """Hand out the keyframes that are ready, without waiting."""
         while self._pending and self._pending[0].done():
@@ -112,6 +113,7 @@ class KeyframeBuilder:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _collect(self) -> None:
+        self._way.give_back()  # who waits for the thread does not hold it up
         keyframes = self._pending.popleft().result()
         self._recent.extend(keyframes)
         self._ready.extend(keyframes)
@@ -131,7 +133,7 @@ class KeyframeBuilder:
 
     def _make(self, request: KeyframeRequest) -> Keyframe:
         frame, c = request.frame, self._config
-        features = extract_features(frame.image, c.sift_features, c.sift_contrast, frame.mask, c.sift_pixels)
+        features = extract_features(frame.image, c.sift_features, c.sift_contrast, frame.mask, c.sift_pixels, self._way)
         ok, jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, c.jpeg_quality])
         assert ok, "an 8-bit image can be encoded"
         return Keyframe(

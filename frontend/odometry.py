@@ -77,7 +77,8 @@ class Frontend:
             self._end_session()
             odometry = replace(self._follow(frame), outcome=Outcome.CLOCK_RESET)
         else:
-            odometry = self._follow(frame)
+            with self._builder.tracking():
+                odometry = self._follow(frame)
         return FrontendResult(odometry, self._builder.take())
 
     def finish(self) -> tuple[Keyframe, ...]:

@@ -202,14 +202,15 @@ std::optional<Converged> converged_from(
 }
 
 std::tuple<Out<float, -1, 5>, Out<uint8_t, -1, kDescriptor>> sift_of(const Rows& image, const std::optional<Grey>& mask,
-                                                                     int64_t most, float contrast) {
+                                                                     int64_t most, float contrast, RightOfWay* way) {
     const Level level = level_with(image);
     require(!mask || (mask->shape(0) == image.shape(0) && mask->shape(1) == image.shape(1)), "a mask has the size of its image");
     require(most > 0, "key points are asked for");
     KeyPoints found;
     {
         nb::gil_scoped_release free;
-        found = sift(level, mask ? mask->data() : nullptr, most, contrast);
+        RightOfWay nobody;
+        found = sift(level, mask ? mask->data() : nullptr, most, contrast, way ? *way : nobody);
     }
     const size_t n = found.table.size() / 5;
     return {give<float, -1, 5>(std::move(found.table), {n, 5}),
@@ -276,7 +277,11 @@ NB_MODULE(_native, m) {
     m.def("strongest", &strongest_of, "image"_a.noconvert(), "cell"_a, "border"_a, "harris_k"_a, "mask"_a.noconvert().none());
     m.def("median_difference", [](const Rows& image) { return median_difference(level_with(image)); },
           "image"_a.noconvert());
-    m.def("sift", &sift_of, "image"_a.noconvert(), "mask"_a.noconvert().none(), "most"_a, "contrast"_a);
+    nb::class_<RightOfWay>(m, "RightOfWay")
+        .def(nb::init<>())
+        .def("take", &RightOfWay::take)
+        .def("give_back", &RightOfWay::give_back);
+    m.def("sift", &sift_of, "image"_a.noconvert(), "mask"_a.noconvert().none(), "most"_a, "contrast"_a, "way"_a.none() = nb::none());
     m.def("apart", &apart_from, "points"_a, "others"_a, "distance"_a, "to_each_other"_a);
     m.def(
         "align_along",

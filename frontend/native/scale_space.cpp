@@ -276,7 +276,7 @@ struct Candidate {
 // Makes an octave and finds what may be its extrema. Its first scale is that of the image, or every other pixel of the
 // octave before.
 SEAMARK_CLONES std::vector<Candidate> make_octave(const Level& image, const Octave* before, float contrast,
-                                                  const Octave& octave) {
+                                                  const Octave& octave, RightOfWay& way) {
     std::vector<Candidate> candidates;
     const Plane* scales = octave.scales;
     const int width = scales[0].width, height = scales[0].height;
@@ -290,6 +290,7 @@ SEAMARK_CLONES std::vector<Candidate> make_octave(const Level& image, const Octa
     const Filters& f = filters();
     const auto has = [height](int y) { return y >= 0 && y < height; };
     for (int y = 0; y < height + delay[kScales - 1] + 1; ++y) {
+        way.let_pass();
         if (has(y)) before ? halved_row(before->scales[kIntervals], scales[0], y) : base_row(image, scales[0], y, row);
         if (has(y - delay[1])) blur_row<kRadius[1]>(scales[0], scales[1], y - delay[1], f.blur[1].data(), row);
         if (has(y - delay[2])) blur_row<kRadius[2]>(scales[1], scales[2], y - delay[2], f.blur[2].data(), row);
@@ -324,7 +325,7 @@ struct Arena {
 
 }  // namespace
 
-ScaleSpace::ScaleSpace(const Level& image, float contrast) {
+ScaleSpace::ScaleSpace(const Level& image, float contrast, RightOfWay& way) {
     thread_local Arena arena;
     int64_t wanted = kVector;
     std::vector<std::pair<int, int>> sides;
@@ -342,7 +343,7 @@ ScaleSpace::ScaleSpace(const Level& image, float contrast) {
         octaves_.push_back(octave);
         const int index = static_cast<int>(octaves_.size()) - 1;
         // Refined only now: an extremum may move into rows that were not there when it was found.
-        for (const Candidate& c : make_octave(image, index ? &octaves_[index - 1] : nullptr, contrast, octave)) {
+        for (const Candidate& c : make_octave(image, index ? &octaves_[index - 1] : nullptr, contrast, octave, way)) {
             Extremum extremum;
             if (!refine(octave, c.layer, c.x, c.y, contrast, extremum)) continue;
             extremum.octave = index;

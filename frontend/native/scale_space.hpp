@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "pyramid.hpp"
+#include "right_of_way.hpp"
 
 namespace seamark {
 
@@ -35,7 +36,7 @@ struct Extremum {
 // planes lie in memory of the thread: they are those of the last image that it has taken.
 class ScaleSpace {
 public:
-    explicit ScaleSpace(const Level& image, float contrast);
+    ScaleSpace(const Level& image, float contrast, RightOfWay& way);
 
     const std::vector<Extremum>& extrema() const { return extrema_; }
     const Octave& octave(int index) const { return octaves_[index]; }

@@ -197,8 +197,8 @@ std::vector<size_t> in_memory_order(const std::vector<Oriented>& oriented) {
 
 }  // namespace
 
-KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float contrast) {
-    const ScaleSpace space(image, contrast);
+KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float contrast, RightOfWay& way) {
+    const ScaleSpace space(image, contrast, way);
     const auto unit = [](const Extremum& e) { return std::ldexp(0.5f, e.octave); };  // pixels of the image
     const auto allowed = [&](const Extremum& e) {
         const int x = static_cast<int>(std::lrint(e.x * unit(e))), y = static_cast<int>(std::lrint(e.y * unit(e)));
@@ -217,6 +217,7 @@ KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float cont
     std::vector<Oriented> oriented;
     for (const Extremum& extremum : extrema) {
         if (static_cast<int64_t>(oriented.size()) >= most) break;
+        way.let_pass();
         orient(plane(extremum), extremum, oriented);
     }
     oriented.resize(std::min<size_t>(oriented.size(), most));
@@ -229,8 +230,10 @@ KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float cont
         const float pixel = unit(e);
         found.table.insert(found.table.end(), {e.x * pixel, e.y * pixel, 2 * e.sigma * pixel, key_point.degrees, e.response});
     }
-    for (size_t k : in_memory_order(oriented))
+    for (size_t k : in_memory_order(oriented)) {
+        way.let_pass();
         describe(plane(*oriented[k].extremum), oriented[k], found.descriptors.data() + kDescriptor * k);
+    }
     return found;
 }
 

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "pyramid.hpp"
+#include "right_of_way.hpp"
 
 namespace seamark {
 
@@ -17,7 +18,8 @@ struct KeyPoints {
 };
 
 // Finds the `most` strongest key points whose response times the intervals of an octave reaches `contrast` (grey levels),
-// strongest first, then by x, y and angle. `mask` (height, width) may be null; where it is zero there is none.
-KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float contrast);
+// strongest first, then by x, y and angle. `mask` (height, width) may be null; where it is zero there is none. Who takes
+// `way` meanwhile is let pass.
+KeyPoints sift(const Level& image, const uint8_t* mask, int64_t most, float contrast, RightOfWay& way);
 
 }  // namespace seamark
