@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from seamark.backend.chain import OdometryChains
 from seamark.backend.config import ConsistencyConfig
 from seamark.backend.consistency import greedy_clique, pair_chi2
+from seamark.backend.graph_types import Constraint
 from seamark.backend.ledger import Finding
 from seamark.backend.loop_groups import Group, LoopGroups, near_pairs
 from seamark.backend.types import Reason
@@ -74,6 +75,15 @@ class PoseJudge:
     def restore(self, finding: Finding) -> None:
         """See :class:`~seamark.backend.ledger.Judge`."""
         self._groups.enter([finding])[0].accepted = True
+
+    def lone_chance(self, loop: Constraint) -> float | None:
+        """Return how probable it is that a wrong loop would close as tight a cycle as this one does by itself.
+
+        None where its cycle, through odometry and all that is accepted, does not close or is none.
+        """
+        accepted = self._groups.accepted()
+        way = self._groups.ways.test(loop, lambda number: self._groups.group_of[number] in accepted)
+        return self._chance(way) if way is not None and self._closes(way) else None
 
     def _verdict(self, group: Group) -> Reason:
         if group.accepted:

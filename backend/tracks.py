@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
 from seamark.backend.matching import match_features
-from seamark.backend.refine_pose import Observations, errors
+from seamark.backend.pose_errors import Observations, errors
 from seamark.frontend import se3
 from seamark.frontend.types import Keyframe
 

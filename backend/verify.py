@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from seamark.backend.config import VerificationConfig
 from seamark.backend.evidence import Evidence, Gate
 from seamark.backend.matching import Matches, match_features
-from seamark.backend.refine_pose import Observations, RefinedPose, explained_without_depth, refine
+from seamark.backend.pose_errors import Observations
+from seamark.backend.refine_pose import RefinedPose, explained_without_depth, refine, worst_deviations
 from seamark.backend.types import Reason
 from seamark.backend.verify_pose import Hypothesis, estimate_pose, estimate_scale, usac_parameters
 from seamark.backend.visibility import Sight, look
@@ -159,16 +160,21 @@ def _verify_pose(trial: _Trial, seed: int) -> Verification | Rejected:
 
 
 def _well_held(trial: _Trial, refined: RefinedPose) -> bool:
-    """Return whether the matches hold the pose: a few far ones in a corner leave it free to swing about them."""
-    rotation, translation = (
-        float(np.sqrt(np.linalg.eigvalsh(refined.covariance[part, part])[-1])) for part in (slice(3), slice(3, 6))
-    )
-    config = trial.config
-    return trial.passes(
-        "rotation_sigma_deg", np.rad2deg(rotation), config.max_rotation_sigma_deg, least=False
-    ) and trial.passes(
-        "translation_sigma_per_depth", translation / refined.depth, config.max_translation_sigma_fraction, least=False
-    )
+    """Return whether the matches hold the pose, and would without any one of them.
+
+    A few far ones in a corner leave it free to swing about them; one other, right or wrong, then decides how it lies.
+    """
+    for name, deviations in (
+        ("sigma", worst_deviations(refined.covariance[None])),
+        ("sigma_without_one", refined.without_one),
+    ):
+        rotation, translation = np.rad2deg(deviations[0]), deviations[1] / refined.depth
+        if not trial.passes(f"rotation_{name}_deg", rotation, trial.config.max_rotation_sigma_deg, least=False):
+            return False
+        limit = trial.config.max_translation_sigma_fraction
+        if not trial.passes(f"translation_{name}_per_depth", translation, limit, least=False):
+            return False
+    return True
 
 
 def _best_hypothesis(trial: _Trial, seed: int) -> Hypothesis | None:

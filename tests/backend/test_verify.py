@@ -7,6 +7,8 @@ import pytest
 
 from seamark.backend.config import VerificationConfig
 from seamark.backend.matching import match_features
+from seamark.backend.pose_errors import Observations, errors, linearise
+from seamark.backend.refine_pose import worst_deviations
 from seamark.backend.types import Reason
 from seamark.backend.verify import Rejected, Verification, verify
 
@@ -221,6 +223,68 @@ def test_a_pose_that_few_far_points_leave_free_is_refused(world, move):
     # The same with many points near by is held.
     near = world(22, 400, low=-5, high=5, near=4, far=9)
     assert isinstance(verify(near.view(move((0, 0.01, 0), (0.3, 0, 0))), near.view(np.eye(4)), CONFIG, 1), Verification)
+
+
+def test_a_pose_that_one_match_holds_is_refused(world, move):
+    """Test: 25 points on a far wall, and near by one that is mistaken or, later, 40 that are right.
+
+    The mistaken one lies where a camera that swings about the wall would see it. Expected: refused, although it fits
+    and makes the pose look sure; with 40 the pose is right.
+    """
+    truth = move((0, 0.01, 0), (0.3, 0, 0))
+    views = [
+        {"T_world_cam": truth, "noise_px": 0.2, "clutter": 0, "depth": False},
+        {"T_world_cam": np.eye(4), "noise_px": 0.2, "clutter": 0},
+    ]
+    wall = world(22, 25, low=-3.2, high=3.2, near=24.9, far=25.1)
+    seen = [wall.view(**view) for view in views]
+    one = world(31, 1, low=-1.5, high=-1.4, near=5, far=5.1)
+    about_wall = move((0, 0, 0), (0, 0, 25)) @ move((0.03, 0.03, 0), (0, 0, 0)) @ move((0, 0, 0), (0, 0, -25))
+    mistaken = {**views[0], "T_world_cam": about_wall @ truth}
+    near = [one.view(**view) for view in (mistaken, views[1])]
+    mistaken_fits = 0
+    for seed in range(20):
+        result = verify(joined(seen[0], near[0]), joined(seen[1], near[1]), CONFIG, seed)
+        assert isinstance(result, Rejected)
+        assert result.reason == Reason.BAD_GEOMETRY
+        if result.inliers == 26:
+            mistaken_fits += 1
+            assert result.evidence.gate("rotation_sigma_deg").passed
+            assert result.evidence.gates[-1].name == "rotation_sigma_without_one_deg"
+    assert 2 <= mistaken_fits <= 15
+    many = world(32, 40, low=-5, high=5, near=6, far=9)
+    near = [many.view(**view) for view in views]
+    result = verify(joined(seen[0], near[0]), joined(seen[1], near[1]), CONFIG, 1)
+    assert isinstance(result, Verification)
+    angle_deg, distance = pose_errors(result.T_match_query, truth)
+    assert angle_deg < 0.1
+    assert distance < 0.02
+
+
+def test_what_is_left_without_one_match_is_what_the_others_say(world, move, ideal):
+    """Test: leave out each match in turn and invert anew. Expected: the worst deviations are those of the system."""
+    w, truth = world(33, 60), move(W, T)
+    query, match = w.view(truth, depth_noise=0.01), w.view(np.eye(4), depth_noise=0.01)
+    found = match_features(query.features, match.features, 0.85)
+    seen = Observations(
+        query.landmarks[found.query].astype(float),
+        match.landmarks[found.match].astype(float),
+        query.features.points[found.query].astype(float),
+        match.features.points[found.match].astype(float),
+        ideal,
+        ideal,
+    )
+    system = linearise(truth, seen, errors(truth, seen) < 3, 0.003, CONFIG)
+    left = system.without_one(np.array([1, 1, 1, 5, 5, 5.0]))
+    each = []
+    for number in np.unique(system.owners):
+        J = system.J[system.owners != number]
+        each.append(np.linalg.inv(J.T @ J) * system.variance_scale)
+    assert len(each) > 20
+    expected = worst_deviations(np.stack(each))
+    assert worst_deviations(left) == pytest.approx(expected, rel=1e-6)
+    everything = worst_deviations(np.linalg.inv(system.J.T @ system.J)[None] * system.variance_scale)
+    assert expected[0] > 1.01 * everything[0]
 
 
 def test_repeated_ground_and_strange_objects_are_refused_by_what_is_missing(world, move):
