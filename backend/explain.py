@@ -1,14 +1,17 @@
 """All that a map knows of one loop: what it rests on, what became of it, and how far the map believes it today."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.config import BackendConfig
+from seamark.backend.config import BackendConfig, VerificationConfig
 from seamark.backend.errors import MapError
 from seamark.backend.evidence import Evidence
+from seamark.backend.far_landmarks import Landmarks, with_far_landmarks
 from seamark.backend.map_store import MapStore, Verdict
 from seamark.backend.types import Loop
 from seamark.backend.verify import pair_seed, verify
@@ -68,13 +71,24 @@ def explain(store: MapStore, loop: Loop, config: BackendConfig, seed: int) -> Ex
     query, match = store.keyframe(loop.query_id), store.keyframe(loop.match_id)
     evidence, source = store.evidence(loop.query_id, loop.match_id), Source.STORED
     if evidence is None and len(query.features) and len(match.features):
-        result = verify(query, match, config.verification, pair_seed(seed, query.id, match.id))
+        far = partial(_far_landmarks, store=store, config=config.verification)
+        result = verify(query, match, config.verification, pair_seed(seed, query.id, match.id), far)
         evidence, source = result.evidence, Source.RECOMPUTED
     if evidence is None:
         source = Source.LOST
     error, chi2, weight = disagreement(loop, store, config.graph.cauchy_width)
     history = store.history(loop.query_id, loop.match_id)
     return Explanation(loop, query, match, evidence, source, history, error, chi2, weight)
+
+
+def _far_landmarks(keyframe: Keyframe, store: MapStore, config: VerificationConfig) -> Landmarks:
+    """Return the landmarks of a keyframe and those that its neighbours in the map add."""
+    neighbours = []
+    for number in (keyframe.previous_id, keyframe.id + 1):
+        with suppress(MapError):
+            neighbours += [] if number is None else [store.keyframe(number)]
+    beside = (one for one in neighbours if keyframe.id == one.previous_id or one.id == keyframe.previous_id)
+    return with_far_landmarks(keyframe, list(beside), config)
 
 
 def disagreement(

@@ -31,7 +31,9 @@ class Observations:
     """M matches as two calibrated cameras see them.
 
     ``X_query X_match`` (M, 3) are the landmarks in their own camera, NaN where unknown, in one unit of length;
-    ``uv_query uv_match`` (M, 2) are ideal pixels.
+    ``uv_query uv_match`` (M, 2) are ideal pixels. ``sigma_query sigma_match`` (M,) are the standard deviations of
+    inverse depth where they are known, NaN (or None for all) where a sensor has measured it: its noise shows between
+    the views.
     """
 
     X_query: Matrix
@@ -40,6 +42,25 @@ class Observations:
     uv_match: Matrix
     query: Camera
     match: Camera
+    sigma_query: NDArray[np.float64] | None = None
+    sigma_match: NDArray[np.float64] | None = None
+
+    @property
+    def measured(self) -> Flags:
+        """Return of which matches (M,) no landmark's deviation is known beforehand."""
+        known = np.zeros(len(self.uv_query), bool)
+        for sigma in (self.sigma_query, self.sigma_match):
+            known |= False if sigma is None else np.isfinite(sigma)
+        return ~known
+
+    def deviations(self, sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the standard deviations of inverse depth (M,) in query and match; ``sigma`` is that of the sensors."""
+        everywhere = np.full(len(self.uv_query), sigma)
+        in_query, in_match = (
+            everywhere if one is None else np.where(np.isnan(one), sigma, one)
+            for one in (self.sigma_query, self.sigma_match)
+        )
+        return in_query, in_match
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +114,8 @@ def errors(T_match_query: Matrix, seen: Observations) -> NDArray[np.float64]:
 
 
 def linearise(T: Matrix, seen: Observations, inliers: Flags, sigma: float, config: VerificationConfig) -> PoseSystem:
-    """Return the errors of the inliers at a pose; ``sigma`` is the standard deviation of inverse depths.
+    """Return the errors of the inliers at a pose; ``sigma`` is the standard deviation of the inverse depths that
+    sensors measured.
 
     The assumed variance counts like PRIOR_FREEDOM errors: few matches cannot pretend to be better than is usual.
     """
@@ -101,20 +123,33 @@ def linearise(T: Matrix, seen: Observations, inliers: Flags, sigma: float, confi
     in_query = inliers & np.isfinite(seen.X_match).all(axis=1)
     in_match = inliers & ~in_query
     both = in_query & np.isfinite(seen.X_query).all(axis=1)
+    s_query, s_match = seen.deviations(sigma)
     X, p = seen.X_match[in_query], se3.transform(T_query_match, seen.X_match[in_query])
     motion = np.concatenate([_hats(p), np.broadcast_to(-np.eye(3), (len(p), 3, 3))], axis=2)
     parts = [
-        _pixels(X, p, T_query_match[:3, :3], motion, seen.uv_query[in_query], seen.query, seen.match, sigma, config)
+        _pixels(
+            X,
+            p,
+            T_query_match[:3, :3],
+            motion,
+            seen.uv_query[in_query],
+            seen.query,
+            seen.match,
+            s_match[in_query],
+            config,
+        )
     ]
     Y, q = seen.X_query[in_match], se3.transform(T, seen.X_query[in_match])
     motion = T[:3, :3] @ np.concatenate([-_hats(Y), np.broadcast_to(np.eye(3), (len(q), 3, 3))], axis=2)
-    parts.append(_pixels(Y, q, T[:3, :3], motion, seen.uv_match[in_match], seen.match, seen.query, sigma, config))
+    parts.append(
+        _pixels(Y, q, T[:3, :3], motion, seen.uv_match[in_match], seen.match, seen.query, s_query[in_match], config)
+    )
     X, Y, p = seen.X_match[both], seen.X_query[both], se3.transform(T_query_match, seen.X_match[both])
     J = (
         -np.concatenate([_hats(p), np.broadcast_to(-np.eye(3), (len(p), 3, 3))], axis=2)[:, 2:]
         / p[:, 2, None, None] ** 2
     )
-    deviation = sigma * np.sqrt(1 + (X[:, 2] / p[:, 2]) ** 4)
+    deviation = np.sqrt(s_query[both] ** 2 + s_match[both] ** 2 * (X[:, 2] / p[:, 2]) ** 4)
     parts.append((J / deviation[:, None, None], ((1 / p[:, 2] - 1 / Y[:, 2]) / deviation)[:, None]))
     cells = [cells_of(seen.uv_query[in_query], seen.query), cells_of(seen.uv_match[in_match], seen.match)]
     cells.append(cells_of(seen.uv_query[both], seen.query))
@@ -153,12 +188,13 @@ def _pixels(
     uv: Matrix,
     camera: Camera,
     other: Camera,
-    sigma: float,
+    sigma: NDArray[np.float64],
     config: VerificationConfig,
 ) -> tuple[Matrix, Matrix]:
     """Return whitened Jacobians (K, 2, 6) and errors (K, 2).
 
-    ``X`` (K, 3) are landmarks in the other camera's frame, ``p`` in this one's, ``motion`` (K, 3, 6) is of p.
+    ``X`` (K, 3) are landmarks in the other camera's frame, ``p`` in this one's, ``motion`` (K, 3, 6) is of p, ``sigma``
+    (K,) the standard deviation of inverse depth.
     """
     focal = np.array([camera.fx, camera.fy])
     projection = np.zeros((len(p), 2, 3))

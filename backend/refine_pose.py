@@ -122,7 +122,8 @@ def explained_without_depth(T_match_query: Matrix, seen: Observations, limit_px:
 
 def depth_sigma(T_match_query: Matrix, seen: Observations, inliers: Flags) -> float:
     """Return the standard deviation of inverse depth, measured between both sides, or 3 per cent where it cannot be."""
-    X_match, X_query = seen.X_match[inliers], seen.X_query[inliers]
+    measured = inliers & seen.measured
+    X_match, X_query = seen.X_match[measured], seen.X_query[measured]
     both = np.isfinite(X_match).all(axis=1) & np.isfinite(X_query).all(axis=1)
     z = np.concatenate([X_match[:, 2][np.isfinite(X_match[:, 2])], X_query[:, 2][np.isfinite(X_query[:, 2])]])
     middle = 1.0 / float(np.median(z)) if len(z) else 1.0
@@ -139,9 +140,10 @@ def _inliers(T: Matrix, seen: Observations, sigma: float, config: VerificationCo
     """Return which matches (M,) appear where they should and, where both depths are known, at the right depth."""
     inliers: Flags = errors(T, seen) < config.reprojection_px
     p = se3.transform(se3.inverse(T), seen.X_match)[:, 2]
+    s_query, s_match = seen.deviations(sigma)
     with np.errstate(invalid="ignore", divide="ignore"):
-        spread = np.sqrt(1 + (seen.X_match[:, 2] / p) ** 4)
-        far = np.abs(1 / p - 1 / seen.X_query[:, 2]) > DEPTH_OUTLIER * np.maximum(sigma * spread, 0.02 / p)
+        spread = np.sqrt(s_query**2 + s_match**2 * (seen.X_match[:, 2] / p) ** 4)
+        far = np.abs(1 / p - 1 / seen.X_query[:, 2]) > DEPTH_OUTLIER * np.maximum(spread, 0.02 / p)
     return np.asarray(inliers & ~far)
 
 

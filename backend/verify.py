@@ -1,5 +1,6 @@
 """Geometric verification: do two keyframes show the same place, and how do their cameras lie to each other?"""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
 from seamark.backend.evidence import Evidence, Gate
+from seamark.backend.far_landmarks import Landmarks, measured_landmarks
 from seamark.backend.matching import Matches, match_features
 from seamark.backend.pose_errors import Observations
 from seamark.backend.refine_pose import RefinedPose, explained_without_depth, refine, worst_deviations
@@ -20,9 +22,11 @@ from seamark.frontend.types import Keyframe
 
 Matrix = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+FarLandmarks = Callable[[Keyframe], Landmarks]
 
 SPREAD_CELLS = (8, 6)
 NEARLY_ALL = 0.8
+FARTHER = 1.25  # times as many matches must have a landmark to try again
 CLOSE_DESCRIPTORS = 60.0  # of 512: two that differ by less are of one thing, however alike the other matches are
 
 
@@ -54,25 +58,30 @@ class Rejected:
     evidence: Evidence | None = field(default=None, compare=False)
 
 
-def verify(query: Keyframe, match: Keyframe, config: VerificationConfig, seed: int) -> Verification | Rejected:
+def verify(
+    query: Keyframe, match: Keyframe, config: VerificationConfig, seed: int, far: FarLandmarks = measured_landmarks
+) -> Verification | Rejected:
     """Compare two keyframes by descriptors, then by the geometry that is known of them.
 
     With calibration and depth on either side: pose from 3D-2D pairs. With calibration only: essential matrix, else
-    fundamental matrix; these tell the place and no metric pose. The same input and ``seed`` give the same result.
+    fundamental matrix; these tell the place and no metric pose. Where what the sensors measured yields no pose, ``far``
+    is asked for landmarks beyond their reach. The same input and ``seed`` give the same result.
     """
     matches = match_features(query.features, match.features, config.match_ratio)
-    trial = _Trial(query, match, matches, config)
+    trial = _Trial(query, match, matches, config, measured_landmarks)
     if not trial.passes("matches", len(matches), config.min_matches):
         return trial.rejected(Reason.FEW_MATCHES)
     if query.camera is None or match.camera is None:
         return _verify_epipolar(trial, seed)
-    depth_pairs = max(
-        np.isfinite(_landmarks(match)[matches.match]).all(1).sum(),
-        np.isfinite(_landmarks(query)[matches.query]).all(1).sum(),
-    )
-    if depth_pairs < config.min_inliers:
-        return _verify_epipolar(trial, seed)
-    return _verify_pose(trial, seed)
+    result = _verify_pose(trial, seed) if trial.depth_pairs >= config.min_inliers else _verify_epipolar(trial, seed)
+    if isinstance(result, Verification) and result.T_match_query is not None:
+        return result
+    farther = _Trial(query, match, matches, config, far)
+    if farther.depth_pairs < max(config.min_inliers, FARTHER * trial.depth_pairs):
+        return result
+    farther.passes("matches", len(matches), config.min_matches)
+    again = _verify_pose(farther, seed)
+    return again if isinstance(again, Verification) or isinstance(result, Rejected) else result
 
 
 def pair_seed(seed: int, query_id: int, match_id: int) -> int:
@@ -83,13 +92,31 @@ def pair_seed(seed: int, query_id: int, match_id: int) -> int:
 class _Trial:
     """One comparison on its way through the gates."""
 
-    def __init__(self, query: Keyframe, match: Keyframe, matches: Matches, config: VerificationConfig) -> None:
+    def __init__(
+        self, query: Keyframe, match: Keyframe, matches: Matches, config: VerificationConfig, far: FarLandmarks
+    ) -> None:
         self.query, self.match, self.matches, self.config = query, match, matches, config
+        self.of_query, self.of_match = far(query), far(match)
         self.inliers: Flags = np.zeros(len(matches), bool)
         self.explained: Flags = np.zeros(len(matches), bool)  # without depth
         self.reprojection_px = float("nan")
         self.missing = np.zeros((0, 2), np.float32)
         self._gates: list[Gate] = []
+
+    @property
+    def depth_pairs(self) -> int:
+        """How many matches have a landmark on the side that has more of them."""
+        return int(max(self.of_query.known[self.matches.query].sum(), self.of_match.known[self.matches.match].sum()))
+
+    @property
+    def X_query(self) -> Matrix:
+        """The landmarks (M, 3) of the matches in the query, NaN where unknown."""
+        return self.of_query.points[self.matches.query]
+
+    @property
+    def X_match(self) -> Matrix:
+        """The landmarks (M, 3) of the matches in the match, NaN where unknown."""
+        return self.of_match.points[self.matches.match]
 
     @property
     def count(self) -> int:
@@ -141,9 +168,8 @@ def _verify_pose(trial: _Trial, seed: int) -> Verification | Rejected:
         return trial.rejected(Reason.CONTRADICTED)
     T_match_query, covariance, scale, scale_sigma = refined.T_match_query, refined.covariance.copy(), 1.0, 1e-3
     if not metric:
-        X_query, X_match = _landmarks(query)[trial.matches.query], _landmarks(match)[trial.matches.match]
         scale, scale_sigma = estimate_scale(
-            T_match_query, best.in_query_units, trial.inliers, X_query, X_match, config.min_scale_pairs
+            T_match_query, best.in_query_units, trial.inliers, trial.X_query, trial.X_match, config.min_scale_pairs
         )
         if best.in_query_units and np.isfinite(scale_sigma):
             T_match_query = T_match_query.copy()
@@ -184,7 +210,7 @@ def _best_hypothesis(trial: _Trial, seed: int) -> Hypothesis | None:
     """
     query, match, config = trial.query, trial.match, trial.config
     assert query.camera is not None and match.camera is not None
-    X_match, X_query = _landmarks(match)[trial.matches.match], _landmarks(query)[trial.matches.query]
+    X_match, X_query = trial.X_match, trial.X_query
     uv_query = query.camera.undistort(query.features.points[trial.matches.query])
     first = estimate_pose(X_match, uv_query, query.camera, config, seed, in_query_units=False)
     if first is not None and query.metric and match.metric:
@@ -201,7 +227,7 @@ def _observations(trial: _Trial, best: Hypothesis, metric: bool) -> Observations
     """Return what both sides have measured; without a common unit only the landmarks that the pose came from."""
     query, match = trial.query, trial.match
     assert query.camera is not None and match.camera is not None
-    X_query, X_match = _landmarks(query)[trial.matches.query], _landmarks(match)[trial.matches.match]
+    X_query, X_match = trial.X_query, trial.X_match
     if not metric and best.in_query_units:
         X_match = np.full_like(X_match, np.nan)
     elif not metric:
@@ -213,22 +239,25 @@ def _observations(trial: _Trial, best: Hypothesis, metric: bool) -> Observations
         match.camera.undistort(match.features.points[trial.matches.match]),
         query.camera,
         match.camera,
+        trial.of_query.sigma[trial.matches.query],
+        trial.of_match.sigma[trial.matches.match],
     )
 
 
 def _look(trial: _Trial, refined: RefinedPose, in_query_units: bool) -> Sight:
     """Look in one view for the landmarks of the other that the pose was found from."""
-    owner, viewer = (trial.query, trial.match) if in_query_units else (trial.match, trial.query)
+    sides = (trial.query, trial.of_query), (trial.match, trial.of_match)
+    (owner, landmarks), (viewer, measured_by) = sides if in_query_units else sides[::-1]
     assert owner.camera is not None and viewer.camera is not None
     T = refined.T_match_query if in_query_units else se3.inverse(refined.T_match_query)
     rows, columns = trial.matches.query[trial.inliers], trial.matches.match[trial.inliers]
     difference = trial.query.features.descriptors[rows].astype(np.float32)
     difference -= trial.match.features.descriptors[columns].astype(np.float32)
     reach = max(1.5 * float(np.median(np.linalg.norm(difference, axis=1))), CLOSE_DESCRIPTORS)
-    measured = _landmarks(viewer)
+    measured = measured_by.points
     if not (owner.metric and viewer.metric):
         measured = np.full_like(measured, np.nan)
-    return look(T, owner.features, _landmarks(owner), owner.camera, viewer.features, measured, viewer.camera, reach)
+    return look(T, owner.features, landmarks.points, owner.camera, viewer.features, measured, viewer.camera, reach)
 
 
 def _verify_epipolar(trial: _Trial, seed: int) -> Verification | Rejected:
@@ -281,11 +310,3 @@ def _well_spread(trial: _Trial) -> bool:
         if not trial.passes(f"hull_{name}", share, trial.config.min_hull_fraction):
             return False
     return True
-
-
-def _landmarks(keyframe: Keyframe) -> NDArray[np.float64]:
-    """Return the landmarks (N, 3) float64, NaN where unknown; all NaN for a keyframe that has none."""
-    count = len(keyframe.features)
-    if len(keyframe.landmarks) != count:
-        return np.full((count, 3), np.nan)
-    return keyframe.landmarks.astype(np.float64)

@@ -1,11 +1,14 @@
 """Which candidates a keyframe or an image is compared with, and what comes of each."""
 
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.config import BackendConfig
+from seamark.backend.config import BackendConfig, VerificationConfig
+from seamark.backend.far_landmarks import Landmarks, measured_landmarks, with_far_landmarks
 from seamark.backend.likelihood import probability
 from seamark.backend.map_memory import KeyframeMemory
 from seamark.backend.types import Place, Reason
@@ -15,7 +18,41 @@ from seamark.vocab.types import Candidate, Candidates
 
 Matrix = NDArray[np.float64]
 Verified = list[tuple[Candidate, Verification | Rejected]]
+FAR_KEPT = 256  # keyframes, some 30 kB each
 PoseOfNeighbour = Callable[[int, Matrix], Matrix | None]  # T_map_cam of a camera from T_keyframe_cam
+
+
+class FarLandmarkCache:
+    """Landmarks of keyframes beyond the reach of their sensors, from neighbours in the map; the last used are kept.
+
+    May be shared by threads.
+    """
+
+    def __init__(self, config: VerificationConfig, memory: KeyframeMemory) -> None:
+        self._config, self._memory = config, memory
+        self._kept: OrderedDict[tuple[int, ...], Landmarks] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def of(self, keyframe: Keyframe, known: Mapping[int, Keyframe]) -> Landmarks:
+        """Return the landmarks of a keyframe with its features; ``known`` are the keyframes of the map by id."""
+        if keyframe.T_odom_cam is None:
+            return measured_landmarks(keyframe)
+        before = None if keyframe.previous_id is None else known.get(keyframe.previous_id)
+        after = known.get(keyframe.id + 1)
+        neighbours = [] if before is None else [before]
+        if after is not None and after.previous_id == keyframe.id:
+            neighbours.append(after)
+        key = (keyframe.id, *(one.id for one in neighbours))
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        found = with_far_landmarks(keyframe, [self._memory.whole(one) for one in neighbours], self._config)
+        with self._lock:
+            self._kept[key] = found
+            while len(self._kept) > FAR_KEPT:
+                self._kept.popitem(last=False)
+        return found
 
 
 class CandidateVerifier:
@@ -27,11 +64,12 @@ class CandidateVerifier:
 
     def __init__(self, config: BackendConfig, mode: Mode, seed: int, memory: KeyframeMemory) -> None:
         self._config, self._places, self._seed, self._memory = config, mode == Mode.PLACES, seed, memory
+        self._far = FarLandmarkCache(config.verification, memory)
 
     def of_keyframe(self, keyframe: Keyframe, candidates: Candidates, known: Mapping[int, Keyframe]) -> Verified:
         """Return what geometry says of a keyframe's candidates; the recent past is none."""
         verified = [
-            (candidate, self._compare(keyframe, self._memory.whole(known[candidate.id])))
+            (candidate, self._compare(keyframe, self._memory.whole(known[candidate.id]), known))
             for candidate in self._islands(candidates, known, keyframe)
         ]
         return self._best_of_islands(verified) if self._places else verified
@@ -40,14 +78,12 @@ class CandidateVerifier:
         self, query: Keyframe, candidates: Candidates, known: Mapping[int, Keyframe], pose_of: PoseOfNeighbour
     ) -> tuple[Place, ...]:
         """Return what geometry says of an image's candidates: localised ones first, then by inliers."""
-        places = [
-            self._place(query, candidate, self._memory.whole(known[candidate.id]), pose_of)
-            for candidate in self._islands(candidates, known, None)
-        ]
+        places = [self._place(query, candidate, known, pose_of) for candidate in self._islands(candidates, known, None)]
         return tuple(sorted(places, key=lambda place: (not place.accepted, -place.inliers)))
 
-    def _compare(self, query: Keyframe, match: Keyframe) -> Verification | Rejected:
-        return verify(query, match, self._config.verification, pair_seed(self._seed, query.id, match.id))
+    def _compare(self, query: Keyframe, match: Keyframe, known: Mapping[int, Keyframe]) -> Verification | Rejected:
+        seed = pair_seed(self._seed, query.id, match.id)
+        return verify(query, match, self._config.verification, seed, lambda keyframe: self._far.of(keyframe, known))
 
     def _islands(
         self, candidates: Candidates, known: Mapping[int, Keyframe], keyframe: Keyframe | None
@@ -88,9 +124,12 @@ class CandidateVerifier:
             for candidate, result in verified
         ]
 
-    def _place(self, query: Keyframe, candidate: Candidate, match: Keyframe, pose_of: PoseOfNeighbour) -> Place:
+    def _place(
+        self, query: Keyframe, candidate: Candidate, known: Mapping[int, Keyframe], pose_of: PoseOfNeighbour
+    ) -> Place:
         """Say what the comparison of a query image with one keyframe means."""
-        result = self._compare(query, match)
+        match = self._memory.whole(known[candidate.id])
+        result = self._compare(query, match, known)
         reason, T_map_cam = Reason.ACCEPTED, None
         if isinstance(result, Rejected):
             reason = result.reason

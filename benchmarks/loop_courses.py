@@ -106,7 +106,7 @@ def kept_file(folder: str, name: str) -> Path:
 def load_kept(path: Path) -> Any:
     try:
         return pickle.loads(path.read_bytes())
-    except (OSError, EOFError, pickle.UnpicklingError):
+    except (OSError, EOFError, AttributeError, pickle.UnpicklingError):
         return None
 
 
@@ -149,11 +149,10 @@ def replay(
     mode = mode or (Mode.STEREO if world == "road" or course in DAYS else Mode.RGBD)
     name = f"{course}-{seed}-{mode}-{image}"
     path = kept_file("replays", f"{name}-{VERSION}")
-    found = load_kept(path)
+    found: Replay | None = load_kept(path)
     if found is None:
         found = _run(name, mode, parts_of(course, seed, image), vocabulary or Vocabulary.default())
         store_kept(path, found)
-    assert isinstance(found, Replay)
     return found
 
 
@@ -206,4 +205,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    import loop_courses  # by its own name, so that other programs can read what it keeps
+
+    loop_courses.main()
