@@ -84,6 +84,46 @@ class VerificationConfig(_Section):
     )
 
 
+class AlignmentConfig(_Section):
+    """How the depth images of two keyframes refine the pose of a loop, or refuse it."""
+
+    enabled: bool = Field(default=True, description="use depth images where both keyframes have one")
+    samples: int = Field(default=2500, ge=200, description="points of each view that are looked for in the other")
+    min_meeting: int = Field(default=200, ge=50, description="points that must meet the other surface to say anything")
+    min_overlap: float = Field(
+        default=0.15, ge=0, le=1, description="share of the points that must, else the pose stays as it was"
+    )
+    max_misfit: float = Field(
+        default=5.0, gt=0, description="deviation of the surfaces per expected one above which it stays so"
+    )
+    max_shift_chi2: float = Field(
+        default=22.46,
+        gt=0,
+        description="chi squared of the refined pose by the covariance of the first above which too",
+    )
+    max_through: float = Field(
+        default=0.25,
+        gt=0,
+        le=1,
+        description="share of what both see that lies where the other looks through, above which a loop is refused",
+    )
+    depth_sigma_floor_m: float = Field(
+        default=0.003, gt=0, description="expected deviation of the small depth image at no distance"
+    )
+    depth_sigma_per_m2: float = Field(
+        default=0.0025, gt=0, description="expected deviation at z metres is floor + this * z^2; residuals correct it"
+    )
+    shared_share: float = Field(
+        default=0.3,
+        ge=0,
+        lt=1,
+        description="share of its variance that depth of one cell of a 4 x 3 grid is expected to have in common",
+    )
+    shared_depth: float = Field(
+        default=0.25, ge=0, description="what all readings of two views err by alike, per deviation at the median depth"
+    )
+
+
 class DriftConfig(_Section):
     """How far odometry may be wrong beyond its covariance.
 
@@ -205,6 +245,7 @@ class BackendConfig(_Section):
     """All settings of the back end."""
 
     verification: VerificationConfig = VerificationConfig()
+    alignment: AlignmentConfig = AlignmentConfig()
     drift: DriftConfig = DriftConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     graph: GraphConfig = GraphConfig()

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.align_surfaces import aligned
 from seamark.backend.config import BackendConfig, VerificationConfig
 from seamark.backend.errors import MapError
 from seamark.backend.evidence import Evidence
@@ -73,6 +74,7 @@ def explain(store: MapStore, loop: Loop, config: BackendConfig, seed: int) -> Ex
     if evidence is None and len(query.features) and len(match.features):
         far = partial(_far_landmarks, store=store, config=config.verification)
         result = verify(query, match, config.verification, pair_seed(seed, query.id, match.id), far)
+        result = aligned(result, query, match, config.alignment)
         evidence, source = result.evidence, Source.RECOMPUTED
     if evidence is None:
         source = Source.LOST

@@ -58,7 +58,7 @@ def encode_keyframe(keyframe: Keyframe, T_previous_odom: NDArray[np.float64] | N
     if T_previous_odom is not None and keyframe.T_odom_cam is not None:
         T_previous_cam = T_previous_odom @ keyframe.T_odom_cam
     previous_id = None if keyframe.previous_id is None else int(keyframe.previous_id)
-    return {
+    rows: dict[str, Values] = {
         "keyframes": (
             *(number, int(keyframe.session), int(keyframe.index), int(keyframe.stamp_ns), keyframe.file),
             *(int(keyframe.metric), None, encode_array(keyframe.T_odom_cam)),
@@ -72,6 +72,7 @@ def encode_keyframe(keyframe: Keyframe, T_previous_odom: NDArray[np.float64] | N
         "images": (number, keyframe.jpeg, encode_array(keyframe.thumbnail)),
         "views": (number, encode_array(lighting_of(keyframe.thumbnail))),
     }
+    return rows | ({"depths": (number, keyframe.depth)} if keyframe.depth else {})
 
 
 def lighting_of(thumbnail: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -101,6 +102,7 @@ def decode_keyframe(
     features: Row | None = None,
     landmarks: Row | None = None,
     images: Row | None = None,
+    depths: Row | None = None,
 ) -> Keyframe:
     """Return the keyframe of its rows; what is None (not asked for, or pruned) is empty."""
     return Keyframe(
@@ -118,6 +120,7 @@ def decode_keyframe(
         T_odom_cam=decode_array(keyframe["T_odom_cam"]),
         covariance=decode_array(edge["covariance"]),
         metric=bool(keyframe["metric"]),
+        depth=b"" if depths is None else depths["inverse"],
     )
 
 
@@ -186,7 +189,7 @@ def row_name(table: str, values: Sequence[Any]) -> str:
         return f"{what} {values[0]} to {values[1]}"
     if table == "keyframes":
         return f"keyframe {values[0]}"
-    if table in ("edges", "features", "landmarks", "images", "poses", "views", "spans"):
+    if table in ("edges", "features", "landmarks", "images", "poses", "views", "depths", "spans"):
         return f"row {table} of keyframe {values[0]}"
     return f"row {values[0]} of {table}"
 

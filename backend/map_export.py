@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.errors import MapError
 from seamark.backend.map_codec import motion_between
+from seamark.backend.map_dense import dense_points
 from seamark.backend.map_store import FEATURES, IMAGES, MapStore
 from seamark.backend.map_tracks import points_of, posed
 from seamark.frontend import se3
@@ -36,10 +37,13 @@ class Format(StrEnum):
     PLY = "ply"
 
 
-def export_map(path: Path, out: Path, kind: Format, component: int | None = None) -> dict[str, int]:
+def export_map(
+    path: Path, out: Path, kind: Format, component: int | None = None, *, dense: bool = False
+) -> dict[str, int]:
     """Write the keyframes of one component (default: that of most keyframes) to ``out``; return what was written.
 
-    ``out`` is a file, for COLMAP a folder, and must not exist. A service may be writing the map. Raises MapError.
+    ``out`` is a file, for COLMAP a folder, and must not exist. ``dense``: a point cloud of the depth images instead of
+    the landmarks. A service may be writing the map. Raises MapError.
     """
     if out.exists():
         raise MapError(f"{out} exists: an export writes something new")
@@ -59,7 +63,7 @@ def export_map(path: Path, out: Path, kind: Format, component: int | None = None
             Format.G2O: _g2o,
         }
         if kind is Format.PLY:
-            return _ply(store, poses, out)
+            return _ply(dense_points(store, poses) if dense else _landmark_rows(store, poses), out)
         with _new_file(out) as file:
             return writer[kind](store, poses, file)
 
@@ -187,19 +191,26 @@ def _colmap_camera(camera: Camera) -> str:
     return f"{model} {size} {' '.join(f'{value:.12g}' for value in numbers)}"
 
 
-def _ply(store: MapStore, poses: Poses, out: Path) -> dict[str, int]:
+def _landmark_rows(store: MapStore, poses: Poses) -> Iterator[NDArray[np.void]]:
+    for batch in _batches(point.position for point in points_of(store, poses)):
+        rows = np.zeros(len(batch), _PLY_ROW)
+        for axis, name in enumerate("xyz"):
+            rows[name] = batch[:, axis]
+        yield rows
+
+
+def _ply(points: Iterator[NDArray[np.void]], out: Path) -> dict[str, int]:
     """Write a binary point cloud; the header comes last, because only then the number of points is known."""
-    count = 0
+    count, row = 0, _PLY_ROW
     with _made_whole(out) as partial, tempfile.TemporaryFile(dir=out.absolute().parent) as body:
-        for batch in _batches(point.position for point in points_of(store, poses)):
-            rows = np.zeros(len(batch), _PLY_ROW)
-            for axis, name in enumerate("xyz"):
-                rows[name] = batch[:, axis]
+        for rows in points:
             body.write(rows.tobytes())
-            count += len(batch)
+            count, row = count + len(rows), rows.dtype
         body.seek(0)
         header = f"ply\nformat binary_little_endian 1.0\ncomment {json.dumps('Seamark, frame of the map')}\n"
-        header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in "xyz") + "end_header\n"
+        kinds = {name: "float" if row[name].kind == "f" else "uchar" for name in row.names or ()}
+        properties = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
+        header += f"element vertex {count}\n{properties}end_header\n"
         with partial.open("wb") as file:
             file.write(header.encode())
             while chunk := body.read(1 << 20):

@@ -10,6 +10,7 @@ BLOBS = {
     "descriptors": "SELECT sum(length(descriptors)) FROM features",
     "key_points": "SELECT sum(length(points) + length(scales) + length(angles)) FROM features",
     "landmarks": "SELECT sum(length(points)) FROM landmarks",
+    "depths": "SELECT sum(length(inverse)) FROM depths",
     "images": "SELECT sum(length(jpeg)) FROM images",
     "thumbnails": "SELECT sum(length(thumbnail)) FROM images",
 }

@@ -16,7 +16,7 @@ Load = Callable[[int], Keyframe]
 
 
 class KeyframeMemory:
-    """Features and landmarks of keyframes; the least recently used give way beyond ``budget_bytes``.
+    """Features, landmarks and depth of keyframes; the least recently used give way beyond ``budget_bytes``.
 
     ``load`` reads a keyframe of the map; without it nothing gives way. May be shared by threads.
     """
@@ -40,7 +40,9 @@ class KeyframeMemory:
             return keyframe  # as a map gives those that were there before
         if len(keyframe.features):
             self._keep(replace(keyframe, jpeg=b"", thumbnail=NO_THUMBNAIL))
-        return replace(keyframe, features=Features.empty(), landmarks=NO_LANDMARKS, jpeg=b"", thumbnail=NO_THUMBNAIL)
+        return replace(
+            keyframe, features=Features.empty(), landmarks=NO_LANDMARKS, jpeg=b"", thumbnail=NO_THUMBNAIL, depth=b""
+        )
 
     def whole(self, keyframe: Keyframe) -> Keyframe:
         """Return a keyframe with its features, as it is where they have been forgotten or cannot be read."""
@@ -57,7 +59,7 @@ class KeyframeMemory:
         except MapError as error:
             logger.error("keyframe %d cannot be compared: %s", keyframe.id, error)
             return keyframe
-        whole = replace(keyframe, features=loaded.features, landmarks=loaded.landmarks)
+        whole = replace(keyframe, features=loaded.features, landmarks=loaded.landmarks, depth=loaded.depth)
         if len(loaded.features):
             self._keep(whole)
         return whole
@@ -85,4 +87,4 @@ class KeyframeMemory:
 def _size(keyframe: Keyframe) -> int:
     features = keyframe.features
     arrays = (features.points, features.scales, features.angles, features.descriptors, keyframe.landmarks)
-    return sum(array.nbytes for array in arrays)
+    return sum(array.nbytes for array in arrays) + len(keyframe.depth)

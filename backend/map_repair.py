@@ -15,8 +15,8 @@ from seamark.backend.map_migrations import V1_COLUMNS, checksum_v1, convert_v1
 from seamark.backend.map_schema import COLUMNS, KEYS, select, upsert
 
 BATCH: Final = 200
-OF_VERSION_3: Final = ("views", "spans", "composed")
-OF_KEYFRAME: Final = ("edges", "features", "landmarks", "images", "poses", "views", "spans")
+ADDED: Final = {3: ("views", "spans", "composed"), 4: ("depths",)}  # tables, by the version that brought them
+OF_KEYFRAME: Final = ("edges", "features", "landmarks", "images", "poses", "views", "depths", "spans")
 
 
 @dataclass
@@ -74,7 +74,7 @@ def _save(path: Path, file: MapFile, report: RepairReport) -> None:
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as old:
             version = old.execute("PRAGMA user_version").fetchone()[0]
-            missing = OF_VERSION_3 if version == 2 else ()
+            missing = [table for since, tables in ADDED.items() if version < since for table in tables]
             rows = _rows_of_v1(old, report) if version == 1 else _rows_by_tables(old, report, stumbled, missing)
             _write(file, rows)
             if version == 1:
@@ -155,7 +155,7 @@ def _mend(database: sqlite3.Connection, report: RepairReport) -> None:
         report.lost.append(f"{len(lost)} keyframes: {_listed(lost)}")
     for table in OF_KEYFRAME:
         database.execute(f"DELETE FROM {table} WHERE keyframe_id NOT IN (SELECT id FROM keyframes)")
-    for table in ("landmarks", "views"):
+    for table in ("landmarks", "views", "depths"):
         database.execute(f"DELETE FROM {table} WHERE keyframe_id NOT IN (SELECT keyframe_id FROM features)")
     dangling = "query_id NOT IN (SELECT id FROM keyframes) OR match_id NOT IN (SELECT id FROM keyframes)"
     gone = database.execute(f"SELECT query_id, match_id FROM loops WHERE {dangling}").fetchall()

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Final
 
 APPLICATION_ID: Final = 0x5EA3A12C
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 
 #: Columns of each table but the last, ``checksum``: the CRC-32 of the table's name and the row's other values. Parents
 #: come before what refers to them.
@@ -25,6 +25,7 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "evidence": ("query_id", "match_id", "content"),
     "history": ("id", "query_id", "match_id", "accepted", "reason", "newest_keyframe_id", "revision"),
     "views": ("keyframe_id", "lighting"),
+    "depths": ("keyframe_id", "inverse"),
     "spans": ("keyframe_id", "steps", "angle", "length", "drift"),
     "composed": ("query_id", "match_id", "count", "scale_sigma"),
 }
@@ -95,7 +96,12 @@ TABLES_OF_3: Final = (
         checksum INTEGER NOT NULL, PRIMARY KEY (query_id, match_id),
         FOREIGN KEY (query_id, match_id) REFERENCES loops (query_id, match_id) ON DELETE CASCADE)""",
 )
-TABLES: Final = TABLES_OF_2 + TABLES_OF_3
+TABLES_OF_4: Final = (
+    """CREATE TABLE depths (
+        keyframe_id INTEGER PRIMARY KEY REFERENCES features (keyframe_id) ON DELETE CASCADE, inverse BLOB NOT NULL,
+        checksum INTEGER NOT NULL)""",
+)
+TABLES: Final = TABLES_OF_2 + TABLES_OF_3 + TABLES_OF_4
 
 
 def upsert(table: str) -> str:

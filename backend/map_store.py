@@ -204,7 +204,9 @@ class MapStore:
         rows = self._rows("keyframes", "id = ?", number)
         if not rows:
             raise MapError(f"{self.path} has no keyframe {keyframe_id}")
-        tables = ("edges",) + ("features", "landmarks") * (FEATURES in parts) + ("images",) * (IMAGES in parts)
+        tables = (
+            ("edges",) + ("features", "landmarks", "depths") * (FEATURES in parts) + ("images",) * (IMAGES in parts)
+        )
         found = {table: next(iter(self._rows(table, "keyframe_id = ?", number)), None) for table in tables}
         edge, camera = _edge(found.pop("edges"), keyframe_id), self._camera(rows[0]["camera_id"])
         return decode_keyframe(rows[0], edge, camera, **found)

@@ -38,17 +38,17 @@ def cells_of(uv: Array, camera: Camera) -> Cells:
 def measured_share(views: Sequence[tuple[Array, Array, Cells]], expected: float) -> float:
     """Return which share of the variance of errors is common to those of one cell.
 
-    ``views``: whitened errors (K, 2) times the root of their weights, the weights (K,) and cells (K,). It is the mean
+    ``views``: whitened errors (K, D) times the root of their weights, the weights (K,) and cells (K,). It is the mean
     product of two errors of a cell over the mean square; ``expected`` where there are few.
     """
     products, pairs, squared, count = 0.0, 0.0, 0.0, 0.0
     for errors, weights, cells in views:
-        sums = np.stack([np.bincount(cells, errors[:, axis]) for axis in (0, 1)], axis=1)
+        sums = np.stack([np.bincount(cells, errors[:, axis]) for axis in range(errors.shape[1])], axis=1)
         own = np.bincount(cells, (errors**2).sum(axis=1))
         products += float(((sums**2).sum(axis=1) - own).sum())
-        pairs += 2.0 * float((np.bincount(cells, weights) ** 2 - np.bincount(cells, weights**2)).sum())
+        pairs += errors.shape[1] * float((np.bincount(cells, weights) ** 2 - np.bincount(cells, weights**2)).sum())
         squared += float(own.sum())
-        count += 2.0 * float(weights.sum())
+        count += errors.shape[1] * float(weights.sum())
     variance = max(squared / max(count, 1.0), 1e-12)
     share = (products / variance + PRIOR_PRODUCTS * expected) / (pairs + PRIOR_PRODUCTS)
     return float(np.clip(HIDDEN * share, 0.0, MOST_SHARE))

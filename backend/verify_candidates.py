@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.align_surfaces import aligned
 from seamark.backend.config import BackendConfig, VerificationConfig
 from seamark.backend.far_landmarks import Landmarks, measured_landmarks, with_far_landmarks
 from seamark.backend.likelihood import probability
@@ -83,7 +84,8 @@ class CandidateVerifier:
 
     def _compare(self, query: Keyframe, match: Keyframe, known: Mapping[int, Keyframe]) -> Verification | Rejected:
         seed = pair_seed(self._seed, query.id, match.id)
-        return verify(query, match, self._config.verification, seed, lambda keyframe: self._far.of(keyframe, known))
+        found = verify(query, match, self._config.verification, seed, lambda keyframe: self._far.of(keyframe, known))
+        return aligned(found, query, match, self._config.alignment)
 
     def _islands(
         self, candidates: Candidates, known: Mapping[int, Keyframe], keyframe: Keyframe | None

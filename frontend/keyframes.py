@@ -22,6 +22,7 @@ from seamark.frontend.depth import DepthSensor
 from seamark.frontend.depth_offset import DepthOffset
 from seamark.frontend.features import extract_features, match_descriptors, thumbnail_of
 from seamark.frontend.kernels import native
+from seamark.frontend.keyframe_depth import NOTHING, encode_depth
 from seamark.frontend.two_view import triangulate
 from seamark.frontend.types import Features, Frame, Keyframe, Mode, Rig
 
@@ -151,7 +152,15 @@ class KeyframeBuilder:
             T_odom_cam=request.T_odom_cam,
             covariance=request.covariance,
             metric=self._mode is not Mode.MONO,
+            depth=self._depth_of(frame),
         )
+
+    def _depth_of(self, frame: Frame) -> bytes:
+        """Return the small depth image of a frame of a depth camera, nothing of others."""
+        wanted = self._mode is Mode.RGBD and self._config.keyframe_depth_px > 0
+        if not wanted or self._rig is None or frame.depth is None:
+            return NOTHING
+        return encode_depth(frame.depth, self._rig.depth_factor, self._config, frame.mask)
 
     def _camera_of(self, frame: Frame) -> Camera | None:
         """Return the calibration if it is for images of this size: in mode places there may be others."""

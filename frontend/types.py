@@ -123,6 +123,7 @@ class Keyframe:
     keyframe. ``landmarks`` (N, 3) float32 are the features' points in this camera's frame, NaN where depth is unknown.
     ``metric`` is False where the session's scale is arbitrary (mono). ``camera`` is None without calibration.
     ``jpeg`` is the image, ``thumbnail`` a small (h, w) grey or (h, w, 3) BGR uint8 copy for the colour histograms.
+    ``depth`` is a small depth image of RGB-D sensors (see keyframe_depth.py), empty without one.
     """
 
     id: int
@@ -139,6 +140,7 @@ class Keyframe:
     T_odom_cam: Matrix | None = None
     covariance: Matrix | None = None
     metric: bool = True
+    depth: bytes = b""
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,6 +91,7 @@ def export_command(
         int | None,
         typer.Option("--component", help="Session whose frame of reference is meant; default: the largest."),
     ] = None,
+    dense: Annotated[bool, typer.Option("--dense", help="With ply: the surfaces of the depth images.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write the keyframes' poses, the pose graph, a COLMAP model or the points of a map."""
@@ -98,7 +99,9 @@ def export_command(
 
     if form not in list(Format):
         raise typer.BadParameter(f"{form!r} is none of {', '.join(Format)}", param_hint="--format")
-    written = export_map(map_file, out, Format(form), component)
+    if dense and form != Format.PLY:
+        raise typer.BadParameter("goes with --format ply", param_hint="--dense")
+    written = export_map(map_file, out, Format(form), component, dense=dense)
     if as_json:
         print_json({"out": str(out), "format": form, **written})
     else:

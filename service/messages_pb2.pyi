@@ -75,7 +75,7 @@ class Features(_message.Message):
     def __init__(self, points: _Optional[_Union[Array, _Mapping]] = ..., scales: _Optional[_Union[Array, _Mapping]] = ..., angles: _Optional[_Union[Array, _Mapping]] = ..., descriptors: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Keyframe(_message.Message):
-    __slots__ = ("schema_version", "id", "session", "index", "stamp_ns", "file", "features", "landmarks", "thumbnail", "jpeg", "camera", "previous_id", "T_odom_cam", "covariance", "metric")
+    __slots__ = ("schema_version", "id", "session", "index", "stamp_ns", "file", "features", "landmarks", "thumbnail", "jpeg", "camera", "previous_id", "T_odom_cam", "covariance", "metric", "depth")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
@@ -91,6 +91,7 @@ class Keyframe(_message.Message):
     T_ODOM_CAM_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     METRIC_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     id: int
     session: int
@@ -106,7 +107,8 @@ class Keyframe(_message.Message):
     T_odom_cam: Array
     covariance: Array
     metric: bool
-    def __init__(self, schema_version: _Optional[int] = ..., id: _Optional[int] = ..., session: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., features: _Optional[_Union[Features, _Mapping]] = ..., landmarks: _Optional[_Union[Array, _Mapping]] = ..., thumbnail: _Optional[_Union[Array, _Mapping]] = ..., jpeg: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., previous_id: _Optional[int] = ..., T_odom_cam: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., metric: _Optional[bool] = ...) -> None: ...
+    depth: bytes
+    def __init__(self, schema_version: _Optional[int] = ..., id: _Optional[int] = ..., session: _Optional[int] = ..., index: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., features: _Optional[_Union[Features, _Mapping]] = ..., landmarks: _Optional[_Union[Array, _Mapping]] = ..., thumbnail: _Optional[_Union[Array, _Mapping]] = ..., jpeg: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., previous_id: _Optional[int] = ..., T_odom_cam: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., metric: _Optional[bool] = ..., depth: _Optional[bytes] = ...) -> None: ...
 
 class Filled(_message.Message):
     __slots__ = ("index", "stamp_ns", "session", "reference_id", "T_reference_cam")

@@ -196,6 +196,7 @@ SCHEMAS: dict[type, Schema] = {
             "T_odom_cam": Optional(_POSE),
             "covariance": Optional(_COVARIANCE),
             "metric": Flag(),
+            "depth": Blob(),
         },
         _keyframe,
     ),

@@ -8,6 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from seamark.frontend.camera import Camera
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.keyframe_depth import encode_depth
 from seamark.frontend.types import Features, Keyframe
 
 IDEAL = Camera(640, 480, 500.0, 505.0, 320.0, 240.0)
@@ -156,6 +158,7 @@ def make_keyframe() -> Callable[[int], Keyframe]:
             previous_id=number - 1 if number else None,
             T_odom_cam=np.linalg.qr(w.rng.normal(size=(4, 4)))[0],
             covariance=np.diag(w.rng.random(6)),
+            depth=encode_depth(w.rng.uniform(1, 3, (48, 64)).astype(np.float32), 1.0, FrontendConfig()),
         )
 
     return make

@@ -52,6 +52,7 @@ def keyframe(number: int) -> Keyframe:
         previous_id=number - 1 if number % 100 else None,
         T_odom_cam=T,
         covariance=np.eye(6) * (number + 1),
+        depth=rng.bytes(500 + number % 5 * 2000),
     )
 
 

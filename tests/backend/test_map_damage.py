@@ -19,9 +19,12 @@ from seamark.backend.map_repair import repair_map
 from seamark.backend.map_schema import COLUMNS, upsert
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.keyframe_depth import encode_depth
 from seamark.frontend.types import Keyframe
 
 COUNT = 60
+DEPTH = encode_depth(np.full((24, 32), 2000, np.uint16), 1000.0, FrontendConfig())
 PAGE = 4096
 
 
@@ -44,7 +47,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory, template: Keyframe) -> Path:
             jpeg = rng.bytes(6000)
             session = number // 30
             store.add_keyframe(
-                replace(template, id=number, session=session, previous_id=previous, T_odom_cam=T, jpeg=jpeg)
+                replace(
+                    template, id=number, session=session, previous_id=previous, T_odom_cam=T, jpeg=jpeg, depth=DEPTH
+                )
             )
         seen = Evidence(np.ones((80, 4), np.float32), np.ones(80, bool), (Gate("inliers", 80, 15),))
         store.add_loops(
@@ -57,7 +62,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, template: Keyframe) -> Path:
         T_map[:, 0, 3] = ids
         store.update_poses(MapSnapshot(9, ids, ids // 30, ids * 0, T_map, np.ones(COUNT), ()))
         with store.file.writing() as database:  # as earlier versions forgot
-            for table in ("images", "landmarks", "features"):
+            for table in ("images", "depths", "landmarks", "features"):
                 database.executemany(f"DELETE FROM {table} WHERE keyframe_id = ?", [(number,) for number in [5]])
             span = Span(3, 0.5, 1.25, np.diag([1e-4] * 6))
             database.execute(upsert("spans"), sealed("spans", encode_span(7, span)))
@@ -78,6 +83,7 @@ def test_a_whole_map_is_whole(whole: Path, tmp_path: Path) -> None:
     assert report.problems == ()
     assert report.rows == {
         "views": 59,
+        "depths": 59,
         "spans": 1,
         "composed": 1,
         "meta": 3,

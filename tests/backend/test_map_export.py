@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import gtsam
 import numpy as np
 import pycolmap
@@ -11,6 +12,8 @@ from seamark.backend.errors import MapError
 from seamark.backend.map_export import Format, export_map
 from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot, Reason
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.keyframe_depth import encode_depth
 from seamark.service.trajectory_files import load_euroc, load_kitti, load_tum
 
 COUNT = 8
@@ -131,3 +134,28 @@ def test_the_point_cloud_is_that_of_the_world(scene, tmp_path) -> None:
     true = distances.min(axis=1) < 1e-2
     assert 0.3 < true.mean() <= 1  # the rest is the clutter of each view
     assert (distances.min(axis=0) < 1e-2).sum() > 250
+
+
+def test_the_dense_point_cloud_is_the_wall_that_was_seen_in_its_colour(tmp_path, make_keyframe, ideal) -> None:
+    """Test: a wall at z = 3 seen from two places, and a keyframe without depth. Expected: all points on it, orange."""
+    orange = np.full((480, 640, 3), (20, 120, 240), np.uint8)
+    jpeg = cv2.imencode(".jpg", orange)[1].tobytes()
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[:, :3, 3] = [(0, 0, 0), (0.5, 0.25, 0.5), (9, 9, 9)]
+    with MapStore(tmp_path / "map.seamark") as store:
+        for number, T_map_cam in enumerate(T):
+            depth = np.full((480, 640), 3 - T_map_cam[2, 3], np.float32)
+            png = encode_depth(depth, 1.0, FrontendConfig()) if number < 2 else b""
+            keyframe = replace(make_keyframe(number), T_odom_cam=T_map_cam, camera=ideal, jpeg=jpeg, depth=png)
+            store.add_keyframe(keyframe)
+        store.update_poses(MapSnapshot(1, np.arange(3), np.ones(3, int), np.ones(3, int), T, np.ones(3), ()))
+    counts = export_map(tmp_path / "map.seamark", tmp_path / "map.ply", Format.PLY, dense=True)
+    header, _, body = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    assert header.count(b"property float") == 3 and header.count(b"property uchar") == 3
+    names = ("x", "y", "z", "red", "green", "blue")
+    points = np.frombuffer(body, list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
+    assert len(points) == counts["points"] > 2 * 0.85 * 160 * 120
+    np.testing.assert_allclose(points["z"], 3, atol=0.01)
+    assert points["x"].min() < -1.7 and points["x"].max() > 1.9
+    for name, value in zip(names[3:], (240, 120, 20), strict=True):
+        np.testing.assert_allclose(points[name].astype(int), value, atol=4)

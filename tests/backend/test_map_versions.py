@@ -2,6 +2,7 @@
 
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from seamark.backend.map_repair import repair_map
 from seamark.backend.map_schema import SCHEMA_VERSION
 from seamark.backend.map_store import MapStore, Verdict
 from seamark.backend.types import Reason
+from seamark.frontend.config import FrontendConfig
+from seamark.frontend.keyframe_depth import encode_depth
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -102,6 +105,30 @@ def test_a_damaged_old_map_is_refused_and_repaired(tmp_path: Path) -> None:
     assert report.damaged == ["row 1 of keyframes"]
     with MapStore(tmp_path / "other.seamark") as store:
         assert store.keyframe_ids() == [0, 2, 3] and store.load_loops()[0].match_id == 0
+
+
+def test_version_3_is_brought_up_to_date_and_takes_depth(tmp_path: Path) -> None:
+    """Test: the map of version 2 without three of its keyframes. Expected: as it was, and depth fits in."""
+    path = tmp_path / "map.seamark"
+    shutil.copy(GOLDEN / "map_v3.seamark", path)
+    with pytest.raises(MapVersionError, match="has map version 3"):
+        MapStore(path, read_only=True)
+    saved = repair_map(path, tmp_path / "new.seamark")
+    assert (saved.damaged, saved.lost, saved.mended) == ([], [], [])
+    png = encode_depth(np.full((48, 64), 2000, np.uint16), 1000.0, FrontendConfig())
+    for name in ("map.seamark", "new.seamark"):
+        with MapStore(tmp_path / name) as store:
+            assert store.keyframe_ids() == [0, 1, 3, 4, 5, 8, 9]
+            assert store.keyframe(8).previous_id == 5 and store.load_spans()[8].steps == 3
+            assert [(loop.query_id, loop.match_id, loop.accepted) for loop in store.load_loops()] == [
+                (3, 1, True),
+                (8, 3, True),
+                (9, 4, False),
+            ]
+            assert store.keyframe(9).depth == b""
+            store.add_keyframe(replace(store.keyframe(9), id=10, previous_id=9, depth=png))
+            assert store.keyframe(10).depth == png and store.keyframe(10, ()).depth == b""
+        assert check_map(tmp_path / name).problems == ()
 
 
 def test_version_2_is_brought_up_to_date_with_all_its_views(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from seamark import SeamarkError
+from seamark.backend.map_schema import SCHEMA_VERSION
 from seamark.service.cli import app
 
 GOLDEN = Path(__file__).parents[1] / "backend" / "golden"
@@ -46,8 +47,14 @@ def make(kind: str, path: Path) -> None:
         ("foreign", "is no map of Seamark"),
         ("another database", "is no map of Seamark"),
         ("folder", "is a folder"),
-        ("version 1", "has map version 1; a service that learns brings it to 3, and so does seamark map repair"),
-        ("version 2", "has map version 2; a service that learns brings it to 3, and so does seamark map repair"),
+        (
+            "version 1",
+            f"has map version 1; a service that learns brings it to {SCHEMA_VERSION}, and so does seamark map",
+        ),
+        (
+            "version 2",
+            f"has map version 2; a service that learns brings it to {SCHEMA_VERSION}, and so does seamark map",
+        ),
     ],
 )
 def test_a_file_that_is_no_map_of_this_version_is_named(
