@@ -94,8 +94,9 @@ def run_command(
     config: ConfigOption = None,
 ) -> None:
     """Replay data end to end: trajectory, loops, map, recording, picture and report."""
+    from seamark.service.config import for_mode
     from seamark.service.report import build_report, report_table
-    from seamark.service.run import RunOptions, for_mode, run
+    from seamark.service.run import RunOptions, run
     from seamark.service.sources.open import open_sources
 
     if localise_only and map_file is None:
@@ -152,6 +153,7 @@ def serve_command(
     config: ConfigOption = None,
 ) -> None:
     """Keep the three nodes alive: frames in, places out, until SIGTERM or Ctrl-C."""
+    from seamark.service.process_end import leave
     from seamark.service.serve import ServeOptions, serve
 
     options = ServeOptions(calib, mode, map_file, vocab, listen, connect, namespace, not no_loops, localise_only)
@@ -161,6 +163,7 @@ def serve_command(
         sys.stdout.flush()
 
     serve(options, _config(config, override, seed), ready)
+    leave(0)
 
 
 @app.command("feed")

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from seamark import SeamarkError
 from seamark.backend.config import BackendConfig
 from seamark.frontend.config import FrontendConfig
+from seamark.frontend.types import Mode
 from seamark.service.validation import dotted, sentence
 from seamark.vocab.config import VocabConfig
 
@@ -69,6 +70,16 @@ def load_config(
         # An unknown section has no origin of its own, but what lies in it has.
         origin = origin or next((o for key, o in origins.items() if key.startswith(f"{location}.")), "")
         raise ConfigError(f"{origin}: {sentence(error, SeamarkConfig)}".removeprefix(": ")) from error
+
+
+def for_mode(config: SeamarkConfig, mode: Mode) -> SeamarkConfig:
+    """Return the configuration as the mode needs it: without motion, the recent past is excluded by count."""
+    if mode is not Mode.PLACES:
+        return config
+    vocab = config.vocab.model_copy(
+        update={"exclude_recent_s": 0.0, "exclude_recent_count": config.vocab.exclude_recent_count_places}
+    )
+    return config.model_copy(update={"vocab": vocab})
 
 
 def dump_yaml(config: SeamarkConfig) -> str:

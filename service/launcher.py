@@ -29,9 +29,9 @@ logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 60.0
 RESTORE_TIMEOUT_S = 1800.0  # a large map without a place index beside it is described anew; who dies is noticed
-STOP_TIMEOUT_S = 3.5  # for all nodes together: 5 s with the launcher's own end, on a busy machine
+STOP_TIMEOUT_S = 4.0  # for all nodes together: 5 s with what is around it, on a busy machine
 # Until when each node may take its time, so that those behind it have theirs; what has not ended then is killed.
-STOP_SHARES = {FRONTEND: 0.4, VOCAB: 0.65, BACKEND: 1.0}
+STOP_SHARES = {FRONTEND: 0.45, VOCAB: 0.75, BACKEND: 1.0}
 MAX_RESTARTS = 3  # of one node within RESTARTS_WITHIN_S: a crash now and then in months is none too many
 RESTARTS_WITHIN_S = 600.0
 PROGRESS_EVERY_S = 0.1

@@ -14,7 +14,7 @@ from seamark.backend.types import MapSnapshot
 from seamark.frontend.types import Frame, Mode, Odometry
 from seamark.service import topics
 from seamark.service.bus import DRAIN_TIMEOUT_S
-from seamark.service.config import SeamarkConfig
+from seamark.service.config import SeamarkConfig, for_mode
 from seamark.service.frame_window import FrameWindow, Nodes, ask
 from seamark.service.launcher import Launcher
 from seamark.service.local_nodes import LocalNodes, own_usage
@@ -83,16 +83,6 @@ def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Pr
         write_files(record, output.staging, settings.config)
         output.commit()
     return record
-
-
-def for_mode(config: SeamarkConfig, mode: Mode) -> SeamarkConfig:
-    """Return the configuration as the mode needs it: without motion, the recent past is excluded by count."""
-    if mode is not Mode.PLACES:
-        return config
-    vocab = config.vocab.model_copy(
-        update={"exclude_recent_s": 0.0, "exclude_recent_count": config.vocab.exclude_recent_count_places}
-    )
-    return config.model_copy(update={"vocab": vocab})
 
 
 def _run_nodes(

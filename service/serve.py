@@ -10,10 +10,9 @@ from seamark.backend.errors import MapUnwritableError
 from seamark.backend.map_store import MapStore
 from seamark.frontend.types import Mode
 from seamark.service.calibration import load_calibration
-from seamark.service.config import SeamarkConfig
+from seamark.service.config import SeamarkConfig, for_mode
 from seamark.service.launcher import Launcher, StartInterruptedError
 from seamark.service.nodes.settings import NodeSettings
-from seamark.service.run import for_mode
 from seamark.service.sources.base import SourceError, choose, offered
 from seamark.service.stop_signal import StopSignal
 

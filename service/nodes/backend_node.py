@@ -1,6 +1,5 @@
 """The back end as a node: keyframes and candidates in; loops, the map and places out."""
 
-import sys
 import threading
 import time
 from collections.abc import Collection
@@ -28,6 +27,7 @@ from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
+from seamark.service.process_end import leave
 from seamark.service.requests import Done, Forget, Status
 from seamark.vocab.types import Candidates, PlaceObservation
 
@@ -274,4 +274,4 @@ def _solver(settings: NodeSettings) -> Solver:
 
 
 if __name__ == "__main__":
-    sys.exit(run_process(topics.BACKEND, build))
+    leave(run_process(topics.BACKEND, build))

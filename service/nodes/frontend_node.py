@@ -1,7 +1,6 @@
 """The front end as a node: frames in; odometry and keyframes out."""
 
 import logging
-import sys
 import threading
 import time
 from dataclasses import replace
@@ -19,6 +18,7 @@ from seamark.service.nodes.keyframe_relay import KeyframeRelay
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
+from seamark.service.process_end import leave
 from seamark.service.requests import Done, EncodedFrame, Status
 from seamark.service.sources.decode import UnreadableImageError, decode, to_image
 
@@ -198,4 +198,4 @@ def build(bus: Bus, settings: NodeSettings) -> FrontendNode:
 
 
 if __name__ == "__main__":
-    sys.exit(run_process(topics.FRONTEND, build))
+    leave(run_process(topics.FRONTEND, build))

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import sys
 import threading
 from concurrent.futures import Future
 from pathlib import Path
@@ -16,6 +15,7 @@ from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places_cache import PlacesCache, cache_path, observe, open_index
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
+from seamark.service.process_end import leave
 from seamark.service.requests import Done, Forget, Status
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.types import Candidates, PlaceObservation
@@ -140,4 +140,4 @@ def build(bus: Bus, settings: NodeSettings) -> VocabNode:
 
 
 if __name__ == "__main__":
-    sys.exit(run_process(topics.VOCAB, build))
+    leave(run_process(topics.VOCAB, build))
