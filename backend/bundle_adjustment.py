@@ -1,9 +1,11 @@
 """Full bundle adjustment of a map: all poses and landmarks together (Triggs et al., "Bundle Adjustment", 1999).
 
 Landmarks are tracks of matches between odometry neighbours and over accepted loops. Where depth was measured it counts
-as the disparity of a narrow pair of eyes, whose error is Gaussian at any distance. Odometry, which has seen the frames
-between keyframes, and the loops' poses count too, for landmarks share errors that no number of them averages out.
-Landmarks are eliminated first (Schur), by the ordering. To be run in a process that answers nobody.
+as the disparity of a narrow pair of eyes, whose error is Gaussian at any distance. A first round hardly looks at depth:
+against its points the warp and the noise of depth are measured (depth_errors.py), which the second round is told.
+Odometry, which has seen the frames between keyframes, and the loops' poses count too, for landmarks share errors that
+no number of them averages out. Landmarks are eliminated first (Schur), by the ordering. To be run in a process that
+answers nobody.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,13 +16,15 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from seamark.backend.bundle_links import followers, measured, odometry_links, pose_of
+from seamark.backend.bundle_links import followers, measured, motion_covariances, odometry_links, pose_of
 from seamark.backend.config import BackendConfig
+from seamark.backend.depth_errors import Depths, measure, parallax_sigma
 from seamark.backend.errors import SolverError
 from seamark.backend.graph_types import Constraint
 from seamark.backend.tracks import Tracks, find_tracks, neighbours, relative_pose
 from seamark.backend.types import Loop
 from seamark.frontend import se3
+from seamark.frontend.camera import Camera
 from seamark.frontend.types import Keyframe
 
 Matrix = NDArray[np.float64]
@@ -31,7 +35,7 @@ OUTLIER = 4.0  # standard deviations beyond which an observation is dropped befo
 HELD_BY = 30  # tracks between neighbours below which what the map says joins them where odometry has no length
 LOST_PX = 50.0  # an observation whose landmark lies behind the camera counts as so far off
 RAYLEIGH = 1.1774  # median length of a vector of two normal errors of deviation 1
-DEPTH_SIGMA = (0.02, 0.003)  # of inverse depth, per median: in the first round, and at least when it is measured
+WEAK_DEPTH = 0.1  # deviation of inverse depth, per median, in the first round
 FIRST_TOLERANCE = 1e-3  # relative change of the error that ends the first round
 PRIOR_SIGMA = 1e-4
 
@@ -40,11 +44,16 @@ PRIOR_SIGMA = 1e-4
 class Adjusted:
     """Poses ``T_map_cam`` (N, 4, 4) of ``keyframe_ids`` (N,), and how well they explain what was seen.
 
-    Errors are median and RMS over the same observations before and after, in pixels.
+    ``scales`` (N,) are map units per unit of a keyframe's landmarks, ``covariances`` (N, 6, 6) of the motions since the
+    keyframe before in ``previous_ids`` (N,), NaN and -1 at the first of a session. Errors are median and RMS over the
+    same observations before and after, in pixels.
     """
 
     keyframe_ids: NDArray[np.int64]
     T_map_cam: Matrix
+    scales: NDArray[np.float64]
+    previous_ids: NDArray[np.int64]
+    covariances: Matrix
     landmarks: int
     observations: int
     dropped: int
@@ -83,25 +92,38 @@ def adjust(
     problem = _Problem(known, T_map_cam, scales, tracks, closed, config)
     start = problem.initial()
     kept = np.ones(len(tracks.track), bool)
-    values, iterations = problem.solve(start, kept, problem.depth_sigma(None), FIRST_TOLERANCE)
-    kept = problem.within(values, OUTLIER)
-    problem.learn_noise(values, kept)
-    values, more = problem.solve(values, kept, problem.depth_sigma(values))
+    first = problem.solve(start, kept, FIRST_TOLERANCE)
+    kept = problem.within(first.values, OUTLIER)
+    problem.learn_noise(first.values, kept)
+    problem.learn_depth(first.values, kept)
+    second = problem.solve(first.values, kept)
+    values = second.values
     before, after = (np.minimum(problem.errors_px(which)[kept], LOST_PX) for which in (start, values))
     ids = np.array(sorted(known), np.int64)
     poses = np.stack([values.atPose3(X(number)).matrix() for number in ids.tolist()])
     if not np.isfinite(poses).all():
         raise SolverError(f"the adjustment of {len(ids)} keyframes has no finite solution")
+    previous_ids, covariances = motion_covariances(second.graph, values, known)
     return Adjusted(
         ids,
         poses,
+        problem.scales(values, kept),
+        previous_ids,
+        covariances,
         tracks.count,
         int(kept.sum()),
         int((~kept).sum()),
         (float(np.median(before)), float(np.median(after))),
         (float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2)))),
-        iterations + more,
+        first.iterations + second.iterations,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    iterations: int
 
 
 class _Problem:
@@ -124,7 +146,10 @@ class _Problem:
             assert keyframe.camera is not None
             pixels[mine] = keyframe.camera.undistort(keyframe.features.points[tracks.feature[mine]])
             points[mine] = keyframe.landmarks[tracks.feature[mine]].astype(np.float64) * scales[number]
-        self._pixels, self._points = pixels, points
+        self._pixels, self._points, self._scales = pixels, points, scales
+        inverse = 1 / points[:, 2]
+        usual = float(np.nanmedian(inverse)) if np.isfinite(inverse).any() else 1.0
+        self._depths = Depths(inverse, WEAK_DEPTH * usual)
         self._metric = all(keyframe.metric for keyframe in keyframes.values())
         self._sigma_px = config.verification.noise_px
         self._loops = loops if self._metric else []
@@ -148,50 +173,72 @@ class _Problem:
             values.insert(L(track), np.nanmedian(world[rows], axis=0))
         return values
 
-    def depth_sigma(self, values: gtsam.Values | None) -> float:
-        """Return the deviation of measured inverse depths (1/map unit): what is usual, or what a solution shows.
-
-        A depth camera that is warped errs alike from frame to frame; only a solution that the pictures have a say in
-        shows it.
-        """
-        z = self._points[:, 2]
-        known = np.isfinite(z)
-        middle = 1 / float(np.median(z[known])) if known.any() else 1.0
-        if values is None or not known.any():
-            return DEPTH_SIGMA[0] * middle
-        points = self._landmarks(values)[self._tracks.track]
-        solved = np.full(len(z), np.nan)
-        for number in self._keyframes:
-            mine = self._tracks.keyframe == number
-            solved[mine] = se3.transform(se3.inverse(values.atPose3(X(number)).matrix()), points[mine])[:, 2]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            difference = np.abs(1 / z - 1 / solved)
-        return max(1.4826 * float(np.nanmedian(difference)), DEPTH_SIGMA[1] * middle)
-
     def learn_noise(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
         """Take the noise of key points from what a solution leaves, if that is more than expected."""
         left = float(np.median(self.errors_px(values)[kept])) / RAYLEIGH
         self._sigma_px = max(self._sigma_px, left)
 
-    def solve(
-        self, start: gtsam.Values, kept: NDArray[np.bool_], depth_sigma: float, tolerance: float = 1e-5
-    ) -> tuple[gtsam.Values, int]:
-        """Return the solution with the kept observations, and the iterations that it took."""
+    def learn_depth(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
+        """Take the warp and the noise of depth from a solution that hardly looked at it."""
+        if not self._metric or not np.isfinite(self._points[:, 2]).any():
+            return
+        centres, focal = np.zeros((len(self._pixels), 3)), np.zeros(len(self._pixels))
+        models: dict[Camera, int] = {}
+        camera = np.zeros(len(self._pixels), np.int64)
+        for number, keyframe in self._keyframes.items():
+            mine = self._tracks.keyframe == number
+            assert keyframe.camera is not None
+            centres[mine], focal[mine] = values.atPose3(X(number)).translation(), keyframe.camera.fx
+            camera[mine] = models.setdefault(keyframe.camera, len(models))
+        points = self._landmarks(values)[self._tracks.track]
+        sigma = parallax_sigma(centres, points, self._tracks.track, self._sigma_px, focal)
+        solved = 1 / self._solved_depths(values)
+        inverse = 1 / self._points[:, 2]
+        self._depths = measure(inverse, solved, sigma, kept, self._pixels, list(models), camera, self._spread)
+
+    def scales(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the map units (N,) per unit of each keyframe's landmarks, by ascending id.
+
+        Sessions without metric scale have landmarks in units of their own: how long they are the solution shows.
+        """
+        scales = np.array([self._scales[number] for number in sorted(self._keyframes)])
+        if self._metric:
+            return scales
+        with np.errstate(invalid="ignore"):
+            ratio = self._solved_depths(values) / self._points[:, 2]
+        for row, number in enumerate(sorted(self._keyframes)):
+            mine = ratio[kept & (self._tracks.keyframe == number)]
+            mine = mine[np.isfinite(mine) & (mine > 0)]
+            if len(mine) >= HELD_BY:
+                scales[row] *= float(np.median(mine))
+        return scales
+
+    def _solved_depths(self, values: gtsam.Values) -> NDArray[np.float64]:
+        """Return where (M,) a solution has each observation's landmark along the camera's axis, NaN behind it."""
+        points = self._landmarks(values)[self._tracks.track]
+        out = np.full(len(points), np.nan)
+        for number in self._keyframes:
+            mine = self._tracks.keyframe == number
+            out[mine] = se3.transform(se3.inverse(values.atPose3(X(number)).matrix()), points[mine])[:, 2]
+        return np.where(out > 1e-6, out, np.nan)
+
+    def solve(self, start: gtsam.Values, kept: NDArray[np.bool_], tolerance: float = 1e-5) -> _Solution:
+        """Return the solution with the kept observations."""
         graph = gtsam.NonlinearFactorGraph()
         robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
         flat = gtsam.noiseModel.Robust.Create(
             robust, gtsam.noiseModel.Isotropic.Sigma(2, self._sigma_px * self._spread)
         )
-        depth = self._depth_noise(robust, depth_sigma)
+        depth = self._depth_noise(robust, self._depths.sigma)
         values, landmarks, poses = gtsam.Values(), set(), sorted(self._keyframes)
         for row, track, number in zip(
             np.flatnonzero(kept), self._tracks.track[kept].tolist(), self._tracks.keyframe[kept].tolist(), strict=True
         ):
             u, v = self._pixels[row]
             mono, stereo = self._cameras[number]
-            z = self._points[row, 2]
-            if self._metric and np.isfinite(z):
-                seen = gtsam.StereoPoint2(u, u - mono.fx() * EYES_M / z, v)
+            inverse = self._depths.inverse[row]
+            if self._metric and np.isfinite(inverse):
+                seen = gtsam.StereoPoint2(u, u - mono.fx() * EYES_M * inverse, v)
                 graph.add(gtsam.GenericStereoFactor3D(seen, depth[number], X(number), L(track), stereo))
             else:
                 graph.add(gtsam.GenericProjectionFactorCal3_S2((u, v), flat, X(number), L(track), mono))
@@ -211,7 +258,7 @@ class _Problem:
             solved = optimizer.optimize()
         except RuntimeError as error:
             raise SolverError(f"the adjustment of {len(poses)} keyframes has no solution: {error}") from error
-        return solved, int(optimizer.iterations())
+        return _Solution(solved, graph, int(optimizer.iterations()))
 
     def errors_px(self, values: gtsam.Values) -> NDArray[np.float64]:
         """Return reprojection errors (M,); infinite for landmarks that the values lack or behind the camera."""

@@ -5,9 +5,10 @@ from typing import Final
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
-from seamark.backend.chain import OdometryChains, white_covariances
+from seamark.backend.chain import OdometryChains, adjoint_stack, white_covariances
 from seamark.backend.config import DriftConfig
 from seamark.backend.drift import drift_share
 from seamark.backend.graph_types import Constraint, Node
@@ -45,6 +46,38 @@ def odometry_links(keyframes: Mapping[int, Keyframe], loops: Sequence[Constraint
         covariance = white_covariances([nodes[number]], T[None], drift, share)[0]
         links.append((before, number, T, covariance * (number - before)))  # keyframes between have been forgotten
     return links
+
+
+def motion_covariances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keyframes: Mapping[int, Keyframe]
+) -> tuple[NDArray[np.int64], Matrix]:
+    """Return of each keyframe (by ascending id) the one before it in its session (N,), and the covariance (N, 6, 6) of
+    the motion since, in its frame; -1 and NaN at the first of a session, NaN where the system does not say.
+    """
+    rows = {number: row for row, number in enumerate(sorted(keyframes))}
+    previous_ids, covariances = np.full(len(rows), -1, np.int64), np.full((len(rows), 6, 6), np.nan)
+    landmarks = gtsam.Ordering()
+    for key in values.keys():  # noqa: SIM118 (no mapping)
+        if gtsam.Symbol(key).chr() == ord("l"):
+            landmarks.push_back(key)
+    try:
+        _, reduced = graph.linearize(values).eliminatePartialMultifrontal(landmarks)
+        marginals = gtsam.Marginals(reduced, values)
+    except RuntimeError:
+        marginals = None
+    for before, number in followers(keyframes):
+        previous_ids[rows[number]] = before
+        if marginals is None:
+            continue
+        keys = [X(before), X(number)]
+        joint = marginals.jointMarginalCovariance(keys)
+        a, b = keys
+        blocks = np.block([[joint.at(a, a), joint.at(a, b)], [joint.at(b, a), joint.at(b, b)]])
+        motion = values.atPose3(a).between(values.atPose3(b)).matrix()
+        J = np.hstack([-adjoint_stack(se3.inverse(motion)[None])[0], np.eye(6)])  # of the motion, in the later frame
+        C = J @ blocks @ J.T
+        covariances[rows[number]] = 0.5 * (C + C.T)
+    return previous_ids, covariances
 
 
 def measured(loops: Sequence[Loop]) -> list[tuple[Loop, Matrix, Matrix]]:

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.errors import BackendInputError
+
+if TYPE_CHECKING:
+    from seamark.backend.adjustment import Adjustment
 
 Matrix = NDArray[np.float64]
 Key = tuple[int, int]  # query and match, which name a loop
@@ -82,21 +85,29 @@ class Estimate:
     scales: NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """A graph that was solved before: ``estimate`` has the poses of all nodes."""
+
+    nodes: Sequence[Node]
+    loops: Sequence[Constraint]
+    estimate: Estimate
+    adjustments: "Sequence[Adjustment]" = ()
+
+
 class Solver(Protocol):
     """What :class:`PoseGraph` (here) and :class:`SolverProcess` (in a child process) both offer."""
 
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed."""
 
-    def restore(
-        self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
-    ) -> None:
+    def restore(self, graph: Graph, held: bool = False) -> None:
         """Take in a graph that was solved before, with the poses of all nodes, and solve nothing.
 
         With ``held`` these poses stay for good: what comes later is fitted to them.
         """
 
-    def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+    def exchange(self, graph: Graph) -> None:
         """Take in another graph, as ``restore`` does, in place of all that was told before."""
 
     def add_loop(self, constraint: Constraint) -> None:

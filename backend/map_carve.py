@@ -19,13 +19,17 @@ HEADER: Final = b"SQLite format 3\0"
 MOST_PAYLOAD: Final = 1 << 28
 _INTEGER_SIZES: Final = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 #: Tables whose first column is the row's number, which SQLite does not store a second time.
-_BY_NUMBER: Final = tuple(table for table in COLUMNS if table not in ("meta", "loops", "evidence", "composed"))
+_BY_NUMBER: Final = tuple(
+    table for table in COLUMNS if table not in ("meta", "loops", "evidence", "composed", "adjusted_loops")
+)
 #: SQLite stores whole numbers of these columns as integers.
 REALS: Final = {
     "poses": ("scale",),
     "loops": ("score", "votes", "jeffrey", "scale"),
     "spans": ("angle", "length"),
     "composed": ("scale_sigma",),
+    "adjusted": ("scale",),
+    "adjusted_loops": ("weight",),
 }
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from seamark.backend.errors import MapCorruptError
+from seamark.backend.map_adjustments import decode_adjusted
 from seamark.backend.map_codec import (
     check_row,
     decode_array,
@@ -82,6 +83,8 @@ def _decode(table: str, row: sqlite3.Row) -> None:
         decode_camera(row["model"])
     elif table == "images":
         decode_array(row["thumbnail"])
+    elif table == "adjusted":
+        decode_adjusted(row)
     elif table in ("edges", "keyframes", "landmarks", "poses", "views"):
         names = (name for name in row.keys() if name not in ("checksum", "file"))  # noqa: SIM118 (no mapping)
         for value in (row[name] for name in names):

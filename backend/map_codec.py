@@ -25,6 +25,14 @@ NO_THUMBNAIL: Final = np.zeros((0, 0), np.uint8)
 NO_LANDMARKS: Final = np.zeros((0, 3), np.float32)
 
 
+_LOOP_TABLES: Final = {
+    "loops": "loop",
+    "evidence": "the evidence of loop",
+    "composed": "what is composed to loop",
+    "adjusted_loops": "what an adjustment made of loop",
+}
+
+
 def encode_array(array: NDArray[Any] | None) -> bytes | None:
     """Return dtype and shape as one line of text, then the numbers in C order, little endian."""
     if array is None:
@@ -184,12 +192,12 @@ def check_row(table: str, row: Sequence[Any] | sqlite3.Row) -> None:
 
 def row_name(table: str, values: Sequence[Any]) -> str:
     """Return what a row is called in messages."""
-    if table in ("loops", "evidence", "composed"):
-        what = {"loops": "loop", "evidence": "the evidence of loop", "composed": "what is composed to loop"}[table]
+    if table in _LOOP_TABLES:
+        what = _LOOP_TABLES[table]
         return f"{what} {values[0]} to {values[1]}"
     if table == "keyframes":
         return f"keyframe {values[0]}"
-    if table in ("edges", "features", "landmarks", "images", "poses", "views", "depths", "spans"):
+    if table in ("edges", "features", "landmarks", "images", "poses", "views", "depths", "spans", "adjusted"):
         return f"row {table} of keyframe {values[0]}"
     return f"row {values[0]} of {table}"
 

@@ -1,9 +1,10 @@
 """A map without some of its keyframes, and how the file of a map becomes it."""
 
 import sqlite3
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
+from seamark.backend.adjustment import Adjustment
 from seamark.backend.contraction import Contraction
 from seamark.backend.graph_types import Key, Node
 from seamark.backend.map_codec import decode_array, encode_array, encode_span, motion_between, sealed
@@ -25,12 +26,14 @@ class Mean:
 class Contracted:
     """What a map is without the keyframes ``graph.gone``.
 
-    ``loops`` are the rows of the composed ones, ``components`` the frame of reference of each session that stays.
+    ``loops`` are the rows of the composed ones, ``components`` the frame of reference of each session that stays,
+    ``adjustments`` what is left of those that stood; others have gone.
     """
 
     graph: Contraction
     loops: tuple[Loop, ...]
     components: Mapping[int, int]
+    adjustments: tuple[Adjustment, ...] = ()
 
     def means(self) -> dict[Key, Mean]:
         """Return what is to be known of composed loops beside their rows."""
@@ -42,8 +45,13 @@ class Contracted:
         return key not in self.graph.dropped and not self.graph.gone.intersection(key)
 
 
-def contracted(graph: Contraction, loops: Mapping[Key, Loop], components: Mapping[int, int]) -> Contracted:
-    """Return what becomes of loops and components (of each session, before) with the graph.
+def contracted(
+    graph: Contraction,
+    loops: Mapping[Key, Loop],
+    components: Mapping[int, int],
+    adjustments: Iterable[Adjustment] = (),
+) -> Contracted:
+    """Return what becomes of loops, components (of each session, before) and adjustments that stand with the graph.
 
     Where the session in whose frame a component is has no keyframe any more, the next one names the frame.
     """
@@ -68,7 +76,8 @@ def contracted(graph: Contraction, loops: Mapping[Key, Loop], components: Mappin
                 evidence=None,
             )
         )
-    return Contracted(graph, tuple(rows), named)
+    left = (one.contracted(graph) for one in adjustments)
+    return Contracted(graph, tuple(rows), named, tuple(one for one in left if one is not None))
 
 
 def write_nodes(database: sqlite3.Connection, change: Contracted) -> None:

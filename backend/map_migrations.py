@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.errors import MapCorruptError
 from seamark.backend.map_codec import decode_array, encode_array, motion_between, sealed
-from seamark.backend.map_schema import TABLES_OF_2, TABLES_OF_3, TABLES_OF_4, upsert
+from seamark.backend.map_schema import TABLES_OF_2, TABLES_OF_3, TABLES_OF_4, TABLES_OF_5, upsert
 
 logger = logging.getLogger(__name__)
 
@@ -137,4 +137,10 @@ def _from_3_to_4(database: sqlite3.Connection) -> None:
         database.execute(statement)
 
 
-MIGRATIONS: Final = (_from_1_to_2, _from_2_to_3, _from_3_to_4)
+def _from_4_to_5(database: sqlite3.Connection) -> None:
+    """Add tables for what full adjustments find."""
+    for statement in TABLES_OF_5:
+        database.execute(statement)
+
+
+MIGRATIONS: Final = (_from_1_to_2, _from_2_to_3, _from_3_to_4, _from_4_to_5)

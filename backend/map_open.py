@@ -27,5 +27,6 @@ def restore(slam: Slam, store: MapStore, *, held: bool = False) -> tuple[list[Ke
     if before:
         loops = [loop for loop in store.load_loops() if loop.query_id <= mapped and loop.match_id <= mapped]
         revision = int(meta.get("revision", 0))
-        slam.restore(before, loops, store.load_poses(), revision, store.load_spans(), store.load_means(), held=held)
+        composed = (store.load_spans(), store.load_means(), store.load_adjustments())
+        slam.restore(before, loops, store.load_poses(), revision, *composed, held=held)
     return before, waiting

@@ -15,8 +15,8 @@ from seamark.backend.map_migrations import V1_COLUMNS, checksum_v1, convert_v1
 from seamark.backend.map_schema import COLUMNS, KEYS, select, upsert
 
 BATCH: Final = 200
-ADDED: Final = {3: ("views", "spans", "composed"), 4: ("depths",)}  # tables, by the version that brought them
-OF_KEYFRAME: Final = ("edges", "features", "landmarks", "images", "poses", "views", "depths", "spans")
+ADDED: Final = {3: ("views", "spans", "composed"), 4: ("depths",), 5: ("adjusted", "adjusted_loops")}  # by version
+OF_KEYFRAME: Final = ("edges", "features", "landmarks", "images", "poses", "views", "depths", "spans", "adjusted")
 
 
 @dataclass
@@ -162,7 +162,7 @@ def _mend(database: sqlite3.Connection, report: RepairReport) -> None:
     if gone:
         report.lost.append(f"{len(gone)} loops: {_listed([f'{row[0]} to {row[1]}' for row in gone])}")
     database.execute(f"DELETE FROM loops WHERE {dangling}")
-    for table in ("evidence", "history", "composed"):
+    for table in ("evidence", "history", "composed", "adjusted_loops"):
         count = database.execute(
             f"DELETE FROM {table} WHERE (query_id, match_id) NOT IN (SELECT query_id, match_id FROM loops)"
         ).rowcount

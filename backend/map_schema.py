@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Final
 
 APPLICATION_ID: Final = 0x5EA3A12C
-SCHEMA_VERSION: Final = 4
+SCHEMA_VERSION: Final = 5
 
 #: Columns of each table but the last, ``checksum``: the CRC-32 of the table's name and the row's other values. Parents
 #: come before what refers to them.
@@ -28,6 +28,8 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "depths": ("keyframe_id", "inverse"),
     "spans": ("keyframe_id", "steps", "angle", "length", "drift"),
     "composed": ("query_id", "match_id", "count", "scale_sigma"),
+    "adjusted": ("keyframe_id", "adjustment", "loops", "previous_id", "T_map_cam", "scale", "covariance"),
+    "adjusted_loops": ("query_id", "match_id", "adjustment", "weight"),
 }
 #: What names a row; all other columns are replaced when it is written again.
 KEYS: Final[dict[str, tuple[str, ...]]] = {
@@ -35,6 +37,7 @@ KEYS: Final[dict[str, tuple[str, ...]]] = {
     "loops": ("query_id", "match_id"),
     "evidence": ("query_id", "match_id"),
     "composed": ("query_id", "match_id"),
+    "adjusted_loops": ("query_id", "match_id"),
 }
 
 # Rows are small where they are read at start (keyframes, edges, poses) and large where they are read one by one.
@@ -101,7 +104,19 @@ TABLES_OF_4: Final = (
         keyframe_id INTEGER PRIMARY KEY REFERENCES features (keyframe_id) ON DELETE CASCADE, inverse BLOB NOT NULL,
         checksum INTEGER NOT NULL)""",
 )
-TABLES: Final = TABLES_OF_2 + TABLES_OF_3 + TABLES_OF_4
+# What a full adjustment found (see adjustment.py): how many loops it rests on stands in every row of it, so that one
+# which has lost some is not believed.
+TABLES_OF_5: Final = (
+    """CREATE TABLE adjusted (
+        keyframe_id INTEGER PRIMARY KEY REFERENCES keyframes (id) ON DELETE CASCADE, adjustment INTEGER NOT NULL,
+        loops INTEGER NOT NULL, previous_id INTEGER, T_map_cam BLOB NOT NULL, scale REAL NOT NULL, covariance BLOB,
+        checksum INTEGER NOT NULL)""",
+    """CREATE TABLE adjusted_loops (
+        query_id INTEGER NOT NULL, match_id INTEGER NOT NULL, adjustment INTEGER NOT NULL, weight REAL NOT NULL,
+        checksum INTEGER NOT NULL, PRIMARY KEY (query_id, match_id),
+        FOREIGN KEY (query_id, match_id) REFERENCES loops (query_id, match_id) ON DELETE CASCADE)""",
+)
+TABLES: Final = TABLES_OF_2 + TABLES_OF_3 + TABLES_OF_4 + TABLES_OF_5
 
 
 def upsert(table: str) -> str:

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.adjustment import Adjustment
 from seamark.backend.errors import MapCorruptError, MapError
 from seamark.backend.evidence import Evidence, decode_evidence, encode_evidence
 from seamark.backend.graph_types import Span
+from seamark.backend.map_adjustments import decode_adjustments, replace_adjustments, write_adjustments
 from seamark.backend.map_codec import (
     check_row,
     decode_array,
@@ -126,9 +128,15 @@ class MapStore:
                 database.execute(upsert(table), sealed(table, values))
 
     def record(
-        self, loops: Iterable[Loop] = (), snapshot: MapSnapshot | None = None, meta: Mapping[str, str] | None = None
+        self,
+        loops: Iterable[Loop] = (),
+        snapshot: MapSnapshot | None = None,
+        meta: Mapping[str, str] | None = None,
+        adjustments: Iterable[Adjustment] = (),
     ) -> None:
-        """Write in one transaction: loops (replacing earlier verdicts on the same pairs), poses, and facts."""
+        """Write in one transaction: loops (replacing earlier verdicts on the same pairs), poses, facts, adjustments
+        (replacing what earlier ones found of the same keyframes).
+        """
         written: dict[int, tuple[NDArray[np.float64], float]] = {}
         with self.file.writing() as database:
             self._write_loops(database, loops)
@@ -137,6 +145,7 @@ class MapStore:
                 written = self._write_poses(database, snapshot)
                 facts["revision"] = str(snapshot.revision)
             database.executemany(upsert("meta"), [sealed("meta", pair) for pair in facts.items()])
+            write_adjustments(database, adjustments)
         self._written |= written
 
     def add_loop(self, loop: Loop) -> None:
@@ -176,6 +185,7 @@ class MapStore:
             write_nodes(database, change)
             self._write_loops(database, change.loops)
             write_means(database, change.means())
+            replace_adjustments(database, change.adjustments)
         for number in change.graph.gone:
             self._written.pop(number, None)
 
@@ -241,6 +251,10 @@ class MapStore:
         return {
             (row["query_id"], row["match_id"]): Mean(row["count"], row["scale_sigma"]) for row in self._rows("composed")
         }
+
+    def load_adjustments(self) -> tuple[Adjustment, ...]:
+        """Return what full adjustments have found, whether they stand or not."""
+        return decode_adjustments(self._rows("adjusted"), self._rows("adjusted_loops"))
 
     def load_lightings(self) -> dict[int, NDArray[np.float64]]:
         """Return mean and spread of the colours (6,) of all keyframes that can be recognised.

@@ -7,13 +7,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.adjustment import Adjustments
 from seamark.backend.chain import OdometryChains, white_covariances
 from seamark.backend.config import BackendConfig, DriftConfig, GraphConfig
 from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.drift import drift_share
 from seamark.backend.errors import BackendInputError, SolverError
 from seamark.backend.graph_poses import GraphPoses
-from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_constraint
+from seamark.backend.graph_types import Constraint, Estimate, Graph, Key, Node, check_constraint
 from seamark.backend.graph_variables import PlanarVariables, PoseVariables, SimilarityVariables
 from seamark.frontend import se3
 
@@ -49,6 +50,7 @@ class PoseGraph:
         self._solved_rows = 0  # those that iSAM2 knows
         self._held_rows = 0  # those whose poses are given
         self._new_loops: list[Key] = []
+        self._adjustments = Adjustments()
         self._chains = OdometryChains(self._drift)
         self._share = 1.0  # of the drift allowed for that the loops bear out
         self._requested = False
@@ -60,25 +62,25 @@ class PoseGraph:
             self._variables = SimilarityVariables(self._config, self._drift)
             self._isam = None
 
-    def restore(
-        self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
-    ) -> None:
+    def restore(self, graph: Graph, held: bool = False) -> None:
         """Take in a graph that was solved before, with the poses of all nodes: nothing is solved until it has to be.
 
         With ``held`` these poses stay for good, and what joins them with each other is of no more use.
         """
-        for node in nodes:
+        for node in graph.nodes:
             self.add_keyframe(node)
-        self._poses.take(estimate)
-        for constraint in constraints:
+        self._poses.take(graph.estimate)
+        for constraint in graph.loops:
             self.add_loop(constraint)
-        self._revision = estimate.revision
+        self._adjustments = Adjustments(graph.adjustments)
+        self._adjustments.update(self._loops)
+        self._revision = graph.estimate.revision
         self._held_rows = len(self._poses) if held else 0
 
-    def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+    def exchange(self, graph: Graph) -> None:
         """Take in another graph, as ``restore`` does, in place of all that was told before."""
         self._clear()
-        self.restore(nodes, constraints, estimate)
+        self.restore(graph)
 
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop, replacing one of the same pair; it acts at the next ``optimise``."""
@@ -112,6 +114,7 @@ class PoseGraph:
     def optimise(self, thorough: bool = False) -> Estimate:
         """Return the poses with all loops so far; raises SolverError when no finite solution is found."""
         moved = self._poses.settle(self._loops)
+        moved |= self._adjustments.update(self._loops)
         self._learn_drift()
         if moved or thorough:
             self._solve_batch()
@@ -231,10 +234,14 @@ class PoseGraph:
             motions = se3.inverse(np.stack([x.T_odom_cam for x in previous])) @ np.stack([x.T_odom_cam for x in nodes])
             covariances = white_covariances(nodes, motions, self._drift, self._share)
             for before, node, motion, covariance in zip(previous, nodes, motions, covariances, strict=True):
+                adjusted = self._adjustments.motion(before.id, node)
+                if adjusted is not None:
+                    motion = adjusted[0]
+                    covariance = covariance if adjusted[1] is None else adjusted[1]
                 graph.add(self._variables.odometry(before.id, node, motion, covariance))
         for key in loops:
             if key in self._loops and max(poses.rows[number] for number in key) >= held:
-                graph.add(self._variables.loop(self._loops[key]))
+                graph.add(self._variables.loop(self._adjustments.constraint(self._loops[key])))
         return graph
 
     def _values(self, rows: Iterable[int]) -> gtsam.Values:

@@ -1,5 +1,6 @@
 """Keyframes and place candidates to verified loops and one consistent map."""
 
+import logging
 import threading
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -7,11 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from seamark.backend.adjustment import Adjustment
 from seamark.backend.config import BackendConfig
 from seamark.backend.contraction import contract
 from seamark.backend.errors import BackendInputError
 from seamark.backend.evidence import Evidence
-from seamark.backend.graph_types import Constraint, Estimate, Key, Matrix, Node, Solver, Span, check_nodes
+from seamark.backend.graph_types import Constraint, Estimate, Graph, Key, Matrix, Node, Solver, Span, check_nodes
 from seamark.backend.loop_verdicts import LoopVerdicts
 from seamark.backend.map_contraction import Contracted, Mean, contracted
 from seamark.backend.map_memory import KeyframeMemory, Load
@@ -21,6 +23,8 @@ from seamark.backend.verify import Rejected, Verification
 from seamark.backend.verify_candidates import CandidateVerifier, Verified
 from seamark.frontend.types import Keyframe, Mode
 from seamark.vocab.types import Candidate, Candidates
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +63,7 @@ class Slam:
         self._verifier = CandidateVerifier(config, mode, seed, self._memory)
         self._loops: dict[Key, Loop] = {}
         self._means: dict[Key, Mean] = {}  # of composed loops
+        self._adjustments: tuple[Adjustment, ...] = ()  # whether they stand or not
         self._committed: set[Key] = set()  # the accepted loops, as far as the graph has been told
         self._evidence: dict[Key, Evidence | None] = {}  # of the last step; all of it would be memory without bound
         self._lock = threading.Lock()
@@ -132,15 +137,17 @@ class Slam:
         revision: int = 0,
         spans: Mapping[int, Span] | None = None,
         means: Mapping[Key, Mean] | None = None,
+        adjustments: Sequence[Adjustment] = (),
         *,
         held: bool = False,
     ) -> None:
         """Take in what a map on disk holds (keyframes in order of id, features or not), accepted loops unasked.
 
         With ``poses``, those of the map at ``revision``, nothing is solved; without, all is. ``spans`` and ``means``
-        are what the map has of keyframes that have gone. ``held``: these poses are never changed.
+        are what the map has of keyframes that have gone, ``adjustments`` what full ones have found. ``held``: these
+        poses are never changed.
         """
-        self._means = dict(means or {})
+        self._means, self._adjustments = dict(means or {}), tuple(adjustments) if poses else ()
         nodes = self._hold(list(keyframes), poses, spans)
         accepted: dict[Key, Constraint | None] = {}
         for loop in loops:
@@ -155,7 +162,7 @@ class Slam:
         if poses and self._solver is not None:
             self._map.revision = revision
             constraints = [constraint for constraint in accepted.values() if constraint is not None]
-            self._solver.restore(nodes, constraints, self._map.estimate(), held=held)
+            self._solver.restore(Graph(nodes, constraints, self._map.estimate(), self._adjustments), held=held)
             self._committed |= set(accepted)
             # Loops may have come after the last solution: the next keyframe asks.
             self._unsolved = bool(accepted) and not held
@@ -177,7 +184,8 @@ class Slam:
         constraints = [constraint for constraint in found if constraint is not None]
         counts = {key: mean.count for key, mean in self._means.items()}
         graph = contract(nodes, constraints, keyframe_ids, self._config.drift, counts)
-        return contracted(graph, self._loops, self._map.components())
+        standing = [one for one in self._adjustments if one.stands(self._committed)]
+        return contracted(graph, self._loops, self._map.components(), standing)
 
     def adopt(self, change: Contracted) -> None:
         """Be the map that ``without`` has said; poses stay what they are until the next solution."""
@@ -187,9 +195,11 @@ class Slam:
             self._map.contract(change.graph.nodes, change.components)
         self._memory.forget(change.graph.gone)
         self._means = {key: mean for key, mean in self._means.items() if change.stays(key)} | change.means()
+        self._adjustments = change.adjustments
         self._verdicts = LoopVerdicts(self._config, self._mode, () if self._solver is None else change.graph.nodes)
         if self._solver is not None:
-            self._solver.exchange(change.graph.nodes, list(change.graph.loops.values()), self._map.estimate())
+            loops = list(change.graph.loops.values())
+            self._solver.exchange(Graph(change.graph.nodes, loops, self._map.estimate(), change.adjustments))
         self._committed = {key for key in self._committed if change.stays(key)} | set(composed)
         for key in sorted(self._committed):
             finding = self._verdicts.finding_of(self._loops[key], self._map.keyframes)
@@ -253,8 +263,13 @@ class Slam:
         if not keys:
             return False
         accepted = {key for key in keys if self._loops[key].accepted}
+        before = [one.stands(self._committed) for one in self._adjustments]
         self._committed.difference_update(keys)
         self._committed |= accepted
+        for one, stood in zip(self._adjustments, before, strict=True):
+            if stood != one.stands(self._committed):
+                what = "no longer stands: a loop that it rests on was withdrawn" if stood else "stands again"
+                logger.warning("the full adjustment of %d keyframes %s", len(one.poses), what)
         if self._solver is None:
             with self._lock:
                 self._map.revision += 1

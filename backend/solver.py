@@ -22,6 +22,7 @@ from seamark.backend.errors import BackendInputError, SolverError
 from seamark.backend.graph_types import (
     Constraint,
     Estimate,
+    Graph,
     Key,
     Matrix,
     Node,
@@ -76,22 +77,20 @@ class SolverProcess:
         self._keyframes.add(node.id)
         self._told.append(("add_keyframe", (node,)))
 
-    def restore(
-        self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate, held: bool = False
-    ) -> None:
+    def restore(self, graph: Graph, held: bool = False) -> None:
         """Take in a graph that was solved before, ``held`` or not; the child hears of it when it is first needed."""
-        check_nodes(nodes)
-        self._keyframes |= {node.id for node in nodes}
-        self._loops |= {constraint.key for constraint in constraints}
-        self._told.append(("restore", (nodes, constraints, estimate, held)))
-        self._revision = estimate.revision
+        check_nodes(graph.nodes)
+        self._keyframes |= {node.id for node in graph.nodes}
+        self._loops |= {constraint.key for constraint in graph.loops}
+        self._told.append(("restore", (graph, held)))
+        self._revision = graph.estimate.revision
 
-    def exchange(self, nodes: Sequence[Node], constraints: Sequence[Constraint], estimate: Estimate) -> None:
+    def exchange(self, graph: Graph) -> None:
         """Take in another graph, as ``restore`` does, in place of all that was told before."""
-        self._told, self._sent = [("exchange", (nodes, constraints, estimate))], 0
-        self._keyframes = {node.id for node in nodes}
-        self._loops = {constraint.key for constraint in constraints}
-        self._revision = estimate.revision
+        self._told, self._sent = [("exchange", (graph,))], 0
+        self._keyframes = {node.id for node in graph.nodes}
+        self._loops = {constraint.key for constraint in graph.loops}
+        self._revision = graph.estimate.revision
         self._outdated = self._asked_at is not None
 
     def add_loop(self, constraint: Constraint) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from seamark.backend.adjustment import AdjustedPose, Adjustment
 from seamark.backend.config import BackendConfig
 from seamark.backend.contraction import contract
 from seamark.backend.graph_types import Constraint, Node
@@ -69,7 +70,7 @@ def forget(store: MapStore, newest: int) -> None:
     constraints = [Constraint(*key, one.T_match_query, one.covariance) for key, one in loops.items()]  # type: ignore[arg-type]
     graph = contract(nodes, constraints, [node.id for node in nodes if node.id <= newest], BackendConfig().drift)
     components = {session.id: session.component for session in store.load_sessions()}
-    store.contract(contracted(graph, loops, components))
+    store.contract(contracted(graph, loops, components, store.load_adjustments()))
 
 
 def write(path: Path, acknowledge: int) -> None:
@@ -82,13 +83,15 @@ def write(path: Path, acknowledge: int) -> None:
         store.add_keyframe(keyframe(number))
         if number:
             loops = [loop(number, number - gap) for gap in (1, 3) if number >= gap + max(0, number - FORGET_AFTER)]
-            snapshot = None
+            snapshot, adjustments = None, []
             if number % 5 == 0:
                 ids = np.arange(max(0, number - 10), number + 1)
                 T = np.tile(np.eye(4), (len(ids), 1, 1))
                 T[:, 0, 3] = number
                 snapshot = MapSnapshot(number, ids, ids // 100, ids * 0, T, np.ones(len(ids)), ())
-            store.record(loops, snapshot, {"mapped": str(number)})
+                poses = {n: AdjustedPose(T[0], 1.0, None, None) for n in ids.tolist() if n > number - FORGET_AFTER}
+                adjustments = [Adjustment(min(poses), poses, {(x.query_id, x.match_id): 1.0 for x in loops})]
+            store.record(loops, snapshot, {"mapped": str(number)}, adjustments)
         if number >= FORGET_AFTER:
             forget(store, number - FORGET_AFTER)
         os.write(acknowledge, f"{number}\n".encode())

@@ -8,10 +8,15 @@ import pytest
 from seamark.backend.bundle_adjustment import adjust
 from seamark.backend.config import BackendConfig
 from seamark.backend.errors import MapError, SolverError
+from seamark.backend.map_open import restore
 from seamark.backend.map_optimise import carried, optimise_map
 from seamark.backend.map_store import MapStore
+from seamark.backend.pose_graph import PoseGraph
+from seamark.backend.slam import Slam
 from seamark.backend.tracks import find_tracks, neighbours
 from seamark.backend.types import Loop, MapSnapshot, Reason
+from seamark.frontend.types import Mode
+from seamark.vocab.types import Candidates
 
 CONFIG = BackendConfig()
 COUNT = 8
@@ -123,6 +128,25 @@ def test_tracks_see_each_keyframe_once(world, move):
         assert len(words) == 1
 
 
+def assert_a_service_keeps(path, poses, keyframes):
+    """A service that opens the map, takes in a keyframe and solves leaves the others where they are, within a mm."""
+    copy = path.with_name("copy.seamark")
+    copy.write_bytes(path.read_bytes())
+    slam = Slam(CONFIG, Mode.RGBD, PoseGraph(CONFIG), 1)
+    with MapStore(copy) as store:
+        (adjustment,) = store.load_adjustments()
+        assert adjustment.loops.keys() == {(COUNT - 1, 0)}
+        known = [n for n in range(1, COUNT) if n not in (3, 4)]  # 3 has no features, so that 4 has no predecessor
+        assert all(adjustment.poses[n].covariance is not None for n in known)
+        assert all(np.linalg.eigvalsh(adjustment.poses[n].covariance).min() > 0 for n in known)
+        store.set_meta({"mapped": str(COUNT - 1)})
+        restore(slam, store)
+    last = keyframes[-1]
+    slam.step(replace(last, id=COUNT, previous_id=COUNT - 1), Candidates(COUNT, 0, ()))
+    slam.finish()
+    np.testing.assert_allclose(slam.snapshot().T_map_cam[:COUNT], poses, atol=1e-3)
+
+
 def test_a_map_gets_a_new_revision_or_keeps_its_poses(world, move, tmp_path):
     keyframes, poses, truth, loop = scene(world, move)
     path = tmp_path / "map.seamark"
@@ -149,6 +173,7 @@ def test_a_map_gets_a_new_revision_or_keeps_its_poses(world, move, tmp_path):
         np.linalg.inv(done.after[2]) @ done.after[3], np.linalg.inv(poses[2]) @ poses[3], atol=1e-9
     )
     assert carried({0: np.eye(4), 5: np.eye(4)}, {0: 2 * np.eye(4)}).keys() == {0, 5}
+    assert_a_service_keeps(path, done.after, keyframes)
     again = optimise_map(path, CONFIG)
     assert np.abs(again.after - done.after).max() < 0.01
     assert again.revision in (None, 9)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from seamark.backend.adjustment import AdjustedPose, Adjustment
 from seamark.backend.errors import MapError
 from seamark.backend.evidence import Evidence, Gate
 from seamark.backend.graph_types import Span
@@ -68,6 +69,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory, template: Keyframe) -> Path:
             database.execute(upsert("spans"), sealed("spans", encode_span(7, span)))
             key = database.execute("SELECT query_id, match_id FROM loops ORDER BY 1, 2").fetchone()
             database.execute(upsert("composed"), sealed("composed", (*key, 2, 0.001)))
+        eye = AdjustedPose(np.eye(4), 1.0, 7, np.eye(6))
+        store.record(adjustments=[Adjustment(8, {8: eye, 9: replace(eye, previous_id=8)}, {(31, 1): 0.5})])
     return path
 
 
@@ -86,6 +89,8 @@ def test_a_whole_map_is_whole(whole: Path, tmp_path: Path) -> None:
         "depths": 59,
         "spans": 1,
         "composed": 1,
+        "adjusted": 2,
+        "adjusted_loops": 1,
         "meta": 3,
         "sessions": 2,
         "cameras": 1,

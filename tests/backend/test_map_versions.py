@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from seamark.backend.adjustment import AdjustedPose, Adjustment
 from seamark.backend.errors import MapCorruptError, MapVersionError
 from seamark.backend.map_check import check_map
 from seamark.backend.map_migrations import MIGRATIONS
@@ -152,4 +153,25 @@ def test_version_2_is_brought_up_to_date_with_all_its_views(tmp_path: Path) -> N
             assert list(light) == [0, 1, 2, 3, 4, 5, 8, 9]
             thumbnail = store.keyframe(9).thumbnail.reshape(-1, 3) / 255
             np.testing.assert_allclose(light[9], [*thumbnail.mean(axis=0), *thumbnail.std(axis=0)], atol=1e-12)
+        assert check_map(tmp_path / name).problems == ()
+
+
+def test_version_4_is_brought_up_to_date_and_takes_an_adjustment(tmp_path: Path) -> None:
+    """Test: the map of version 3 and a keyframe with depth. Expected: as it was, and what an adjustment finds fits."""
+    path = tmp_path / "map.seamark"
+    shutil.copy(GOLDEN / "map_v4.seamark", path)
+    with pytest.raises(MapVersionError, match="has map version 4"):
+        MapStore(path, read_only=True)
+    saved = repair_map(path, tmp_path / "new.seamark")
+    assert (saved.damaged, saved.lost, saved.mended) == ([], [], [])
+    pose = AdjustedPose(np.eye(4), 1.0, 8, np.eye(6))
+    for name in ("map.seamark", "new.seamark"):
+        with MapStore(tmp_path / name) as store:
+            assert store.keyframe_ids() == [0, 1, 3, 4, 5, 8, 9, 10]
+            assert store.keyframe(8).previous_id == 5 and store.load_spans()[8].steps == 3
+            assert len(store.keyframe(10).depth) > 50 and store.keyframe(9).depth == b""
+            assert store.load_adjustments() == ()
+            store.record(adjustments=[Adjustment(8, {8: pose, 9: pose}, {(8, 3): 0.5})])
+            (found,) = store.load_adjustments()
+            assert (list(found.poses), found.loops) == ([8, 9], {(8, 3): 0.5})
         assert check_map(tmp_path / name).problems == ()
