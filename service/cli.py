@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from seamark import SeamarkError, __version__
+from seamark.service.covariance_commands import covariances_command
 from seamark.service.graph_commands import graph_app
 from seamark.service.loop_commands import loops_command
 from seamark.service.map_commands import map_app
@@ -40,6 +41,7 @@ app.add_typer(places_app, name="places")
 app.add_typer(map_app, name="map")
 map_app.command("loops")(loops_command)
 map_app.command("optimise")(optimise_command)
+map_app.command("covariances")(covariances_command)
 
 Sources = Annotated[list[str], typer.Argument(help="Folders, videos or synth:NAME, taken one after another.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
