@@ -72,9 +72,10 @@ class PoseJudge:
         changed = [g for n, g in self._groups.by_number.items() if g in entered or before.get(n) != self._verdict(g)]
         return {member: self._verdict(group) for group in changed for member in group.members}
 
-    def restore(self, finding: Finding) -> None:
+    def restore(self, findings: Sequence[Finding]) -> None:
         """See :class:`~seamark.backend.ledger.Judge`."""
-        self._groups.enter([finding])[0].accepted = True
+        for group in self._groups.enter(findings):
+            group.accepted = True
 
     def lone_chance(self, loop: Constraint) -> float | None:
         """Return how probable it is that a wrong loop would close as tight a cycle as this one does by itself.

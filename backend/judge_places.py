@@ -37,9 +37,10 @@ class PlaceJudge:
                 self._verdicts[number] = verdicts[number] = verdict
         return verdicts
 
-    def restore(self, finding: Finding) -> None:
+    def restore(self, findings: Sequence[Finding]) -> None:
         """See :class:`~seamark.backend.ledger.Judge`."""
-        self._append(finding, Reason.ACCEPTED)
+        for finding in findings:
+            self._append(finding, Reason.ACCEPTED)
 
     def _append(self, finding: Finding, verdict: Reason) -> int:
         number = len(self._findings)

@@ -39,8 +39,8 @@ class Judge(Protocol):
     def enter(self, findings: Sequence[Finding]) -> Mapping[int, Reason]:
         """Take in findings; return the verdicts, by number, that are new or may have changed."""
 
-    def restore(self, finding: Finding) -> None:
-        """Take in a finding that was accepted in an earlier life, unasked."""
+    def restore(self, findings: Sequence[Finding]) -> None:
+        """Take in findings that were accepted in an earlier life, unasked."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,11 @@ class LoopLedger:
                 changes[self._findings[number].key] = verdict
         return changes
 
-    def restore(self, finding: Finding) -> None:
-        """Enter a finding that was accepted in an earlier life, unasked."""
-        self._append(finding, LoopHistory(Reason.ACCEPTED, finding.query_id))
-        self._judge.restore(finding)
+    def restore(self, findings: Sequence[Finding]) -> None:
+        """Enter findings that were accepted in an earlier life, unasked."""
+        for finding in findings:
+            self._append(finding, LoopHistory(Reason.ACCEPTED, finding.query_id))
+        self._judge.restore(findings)
 
     def finding(self, key: Key) -> Finding:
         """Return the finding of this pair of keyframes."""

@@ -78,9 +78,9 @@ class LoopVerdicts:
             )
         return Finding(loop.query_id, loop.match_id, query.session, match.session, loop.inliers, constraint)
 
-    def restore(self, finding: Finding) -> None:
-        """Take in a finding that was accepted in an earlier life, unasked."""
-        self._ledger.restore(finding)
+    def restore(self, findings: Sequence[Finding]) -> None:
+        """Take in findings that were accepted in an earlier life, unasked."""
+        self._ledger.restore(findings)
 
     def constraint(self, key: Key) -> Constraint | None:
         """Return what a finding tells the graph, None where it has no pose."""

@@ -1,7 +1,7 @@
 """Which views of a map can be forgotten, so that each place stays recognisable in each of its lightings."""
 
 import heapq
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from seamark.backend.config import MapConfig
 from seamark.backend.map_relations import Relations, View
 from seamark.backend.map_store import MapStore
+from seamark.backend.types import MapSnapshot
 
-__all__ = ["Pruning", "View", "budget", "choose", "views_of"]
+__all__ = ["Pruning", "View", "budget", "choose", "views_in", "views_of"]
 
-COMPARED: Final = 2000  # views of the densest places, whose relations are looked at together
+COMPARED: Final = 1000  # views of the densest places, whose relations are looked at together
 KEEP_SHARE = 0.9  # of a budget, once it is exceeded: pruning shall be rare
 
 
@@ -32,9 +33,22 @@ def views_of(store: MapStore) -> list[View]:
     poses, sessions, views = store.load_poses(), store.session_of_keyframes(), []
     for number, lighting in sorted(store.load_lightings().items()):
         T, component, _ = poses.get(number, (None, sessions[number], 1.0))
-        position, direction = (None, None) if T is None else (T[:3, 3], T[:3, 2])
-        views.append(View(number, component, position, direction, lighting))
+        views.append(_view(number, component, T, lighting))
     return views
+
+
+def views_in(snapshot: MapSnapshot, lightings: Mapping[int, NDArray[np.float64]]) -> list[View]:
+    """Return the views of a map in memory that can be recognised, those of ``lightings``, by ascending id."""
+    posed: NDArray[np.bool_] = np.asarray(np.isfinite(snapshot.T_map_cam).all(axis=(1, 2)))
+    return [
+        _view(number, int(snapshot.components[row]), snapshot.T_map_cam[row] if posed[row] else None, lightings[number])
+        for row, number in enumerate(snapshot.keyframe_ids.tolist())
+        if number in lightings
+    ]
+
+
+def _view(number: int, component: int, T: NDArray[np.float64] | None, lighting: NDArray[np.float64]) -> View:
+    return View(number, component, None if T is None else T[:3, 3], None if T is None else T[:3, 2], lighting)
 
 
 def choose(

@@ -30,6 +30,13 @@ class View:
     lighting: Vector
 
 
+def _squared_distances(ones: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the squared distances (n, m) of points (n, 3) and (m, 3) that are near to each other."""
+    middle = ones.mean(axis=0)  # far from the origin their squares would drown the differences
+    a, b = ones - middle, others - middle
+    return np.asarray((a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T))
+
+
 class Relations:
     """The views that may stand for each view, by rows; found for those rows only that are asked for (``compare``).
 
@@ -78,9 +85,8 @@ class Relations:
         config, at_once = self._config, max(1, PAIRS_AT_ONCE // len(others))
         for start in range(0, len(rows), at_once):
             part = rows[start : start + at_once]
-            apart = np.linalg.norm(self._position[part, None] - self._position[None, others], axis=2)
-            along = self._direction[part] @ self._direction[others].T
-            alike = (apart < config.place_m) & (along > np.cos(np.deg2rad(config.place_deg)))
+            alike = self._direction[part] @ self._direction[others].T > np.cos(np.deg2rad(config.place_deg))
+            alike &= _squared_distances(self._position[part], self._position[others]) < config.place_m**2
             alike &= part[:, None] != others[None]
             one, other = np.nonzero(alike)
             light = np.abs(self._lighting[part[one]] - self._lighting[others[other]]).max(axis=1) < config.lighting

@@ -89,7 +89,9 @@ class MapState:
         """Keep these keyframes only, each hanging on its node's predecessor, at the poses that they have."""
         kept = {node.id: node for node in nodes}
         self.keyframes = {
-            number: replace(keyframe, previous_id=kept[number].previous_id)
+            number: keyframe
+            if keyframe.previous_id == kept[number].previous_id
+            else replace(keyframe, previous_id=kept[number].previous_id)
             for number, keyframe in self.keyframes.items()
             if number in kept
         }

@@ -256,12 +256,13 @@ class MapStore:
         """Return what full adjustments have found, whether they stand or not."""
         return decode_adjustments(self._rows("adjusted"), self._rows("adjusted_loops"))
 
-    def load_lightings(self) -> dict[int, NDArray[np.float64]]:
-        """Return mean and spread of the colours (6,) of all keyframes that can be recognised.
+    def load_lightings(self, after: int = -1) -> dict[int, NDArray[np.float64]]:
+        """Return mean and spread of the colours (6,) of all keyframes ``after`` this one that can be recognised.
 
         Only those of files of earlier versions are read from the images, once.
         """
-        found = {row["keyframe_id"]: decode_array(row["lighting"]) for row in self._rows("views")}
+        views = self._rows("views", "keyframe_id > ?", (after,))
+        found = {row["keyframe_id"]: decode_array(row["lighting"]) for row in views}
         missing = [number for number, lighting in found.items() if lighting is None]
         for number in missing:
             found[number] = lighting_of(self.keyframe(number, (IMAGES,)).thumbnail)

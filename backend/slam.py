@@ -13,7 +13,8 @@ from seamark.backend.config import BackendConfig
 from seamark.backend.contraction import contract
 from seamark.backend.errors import BackendInputError
 from seamark.backend.evidence import Evidence
-from seamark.backend.graph_types import Constraint, Estimate, Graph, Key, Matrix, Node, Solver, Span, check_nodes
+from seamark.backend.graph_types import Estimate, Graph, Key, Matrix, Node, Solver, Span, check_nodes
+from seamark.backend.ledger import Finding
 from seamark.backend.loop_verdicts import LoopVerdicts
 from seamark.backend.map_contraction import Contracted, Mean, contracted
 from seamark.backend.map_memory import KeyframeMemory, Load
@@ -149,16 +150,16 @@ class Slam:
         """
         self._means, self._adjustments = dict(means or {}), tuple(adjustments) if poses else ()
         nodes = self._hold(list(keyframes), poses, spans)
-        accepted: dict[Key, Constraint | None] = {}
+        findings: list[Finding] = []
         for loop in loops:
             with self._lock:
                 self._loops[loop.query_id, loop.match_id] = loop
             if loop.accepted and (self._solver is None or loop.T_match_query is not None):
                 mean = self._means.get((loop.query_id, loop.match_id))
                 scale_sigma = None if mean is None else mean.scale_sigma
-                finding = self._verdicts.finding_of(loop, self._map.keyframes, scale_sigma)
-                self._verdicts.restore(finding)
-                accepted[finding.key] = finding.constraint
+                findings.append(self._verdicts.finding_of(loop, self._map.keyframes, scale_sigma))
+        self._verdicts.restore(findings)
+        accepted = {finding.key: finding.constraint for finding in findings}
         if poses and self._solver is not None:
             self._map.revision = revision
             constraints = [constraint for constraint in accepted.values() if constraint is not None]
@@ -201,11 +202,11 @@ class Slam:
             loops = list(change.graph.loops.values())
             self._solver.exchange(Graph(change.graph.nodes, loops, self._map.estimate(), change.adjustments))
         self._committed = {key for key in self._committed if change.stays(key)} | set(composed)
-        for key in sorted(self._committed):
-            finding = self._verdicts.finding_of(self._loops[key], self._map.keyframes)
-            if key in change.graph.loops:
-                finding = replace(finding, constraint=change.graph.loops[key])
-            self._verdicts.restore(finding)
+        findings = [self._verdicts.finding_of(self._loops[key], self._map.keyframes) for key in sorted(self._committed)]
+        given = change.graph.loops
+        self._verdicts.restore(
+            [replace(one, constraint=given[one.key]) if one.key in given else one for one in findings]
+        )
         self._unsolved = bool(change.graph.loops)
 
     def locate(self, query: Keyframe, candidates: Candidates) -> tuple[Place, ...]:

@@ -30,7 +30,7 @@ from seamark import SeamarkError
 from seamark.backend.config import BackendConfig, MapConfig, VerificationConfig
 from seamark.backend.graph_types import Constraint, Node
 from seamark.backend.map_open import loader, restore
-from seamark.backend.map_prune import choose, views_of
+from seamark.backend.map_prune import choose, views_in
 from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam
 from seamark.backend.solver import SolverProcess
@@ -244,7 +244,7 @@ def laps(folder: Path, count: int, per_lap: int, keep: int) -> list[dict[str, An
 
 
 def prune(folder: Path, count: int) -> dict[str, object]:
-    """Return how long each part of forgetting 500 keyframes takes in a map of ten laps with loops between them."""
+    """Return how long each part of forgetting AT_ONCE keyframes takes in a map of ten laps with loops between them."""
     path, per_lap = folder / "map.seamark", count // 10
     template = keyframe(0, per_lap, 0, 8)
     ids, T = np.arange(count), np.stack([pose(number, per_lap) for number in range(count)])
@@ -268,7 +268,8 @@ def prune(folder: Path, count: int) -> dict[str, object]:
         store.file.database.execute("PRAGMA synchronous = FULL")
         slam = Slam(config, Mode.RGBD, SolverProcess(config), 0, loader(store))
         restore(slam, store)
-        views = timed("views", lambda: views_of(store))
+        lightings = timed("lightings, the first time", store.load_lightings)
+        views = timed("views", lambda: views_in(slam.snapshot(), lightings))
         pruning = timed("choose", lambda: choose(views, int(0.9 * count), (), config.map, (), AT_ONCE))
         change = timed("contract", lambda: slam.without(pruning.forget))
         timed("write", lambda: store.contract(change))

@@ -52,7 +52,7 @@ class RecordingSlam(Slam):
         judge = PoseJudge(chains, config.consistency)
         for loop in self.snapshot().loops:
             if loop.accepted and (loop.query_id, loop.match_id) in loops:
-                judge.restore(self._verdicts.finding_of(loop, self._map.keyframes))
+                judge.restore([self._verdicts.finding_of(loop, self._map.keyframes)])
         return judge
 
 

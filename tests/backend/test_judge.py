@@ -77,6 +77,21 @@ def test_a_false_group_that_came_first_falls_soon_after_it_is_contradicted():
     assert all(ledger.history((q, q - LAP)).verdict == Reason.ACCEPTED for q in range(106, 160))
 
 
+def test_restored_at_once_or_one_by_one_is_the_same():
+    """Test: accepted loops of two places, some of them wrong, restored both ways. Expected: the same verdicts later."""
+    rng = np.random.default_rng(4)
+    (at_once, truth, _), (one_by_one, _, _) = ledger_after(), ledger_after()
+    old = [finding(truth, q, q - LAP, rng, offset=0.8 * (q % 7 == 0)) for q in (*range(101, 140, 2), *range(150, 170))]
+    at_once.restore(old)
+    for loop in old:
+        one_by_one.restore([loop])
+    later = [finding(truth, q, q - LAP, rng, offset=1.5 * (q % 5 == 0)) for q in range(140, 200) if not 150 <= q < 170]
+    changes = [[ledger.add(loop) for loop in later] for ledger in (at_once, one_by_one)]
+    assert changes[0] == changes[1] and any(len(changed) > 1 for changed in changes[0])
+    for loop in (*old, *later):
+        assert at_once.history(loop.key) == one_by_one.history(loop.key)
+
+
 def test_true_loops_withstand_a_false_group_that_comes_later():
     ledger, truth, _ = ledger_after()
     rng = np.random.default_rng(2)
