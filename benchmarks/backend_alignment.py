@@ -50,6 +50,7 @@ LAX = VerificationConfig(
     max_rotation_sigma_deg=10,
     max_translation_sigma_fraction=1,
 )
+CONFIG = FrontendConfig(keyframe_depth_px=160)
 MOST_PAIRS = 250
 NEAR_M, NEAR_DEG = 1.2, 40.0
 HEAD = "| what | pose from | true loops | cm p50 / p95 | degrees p50 / p95 | NEES median / mean |"
@@ -79,7 +80,7 @@ def course(name: str) -> Replay:
     keyframes = []
     for keyframe in made.keyframes:
         depth = sensor.decode(frames[keyframe.file], 0, keyframe.file).depth
-        keyframes.append(replace(keyframe, depth=encode_depth(depth, factor, FrontendConfig())))
+        keyframes.append(replace(keyframe, depth=encode_depth(depth, factor, CONFIG)))
     return replace(made, keyframes=keyframes)
 
 
@@ -88,7 +89,7 @@ def sequence(path: str) -> Replay:
     source = open_sources([path], mode="rgbd")
     truth = source.ground_truth
     assert truth is not None
-    frontend, keyframes = Frontend(source.rig, source.mode, FrontendConfig()), []
+    frontend, keyframes = Frontend(source.rig, source.mode, CONFIG), []
     for frame in source.frames():
         keyframes += frontend.step(frame).keyframes
     keyframes += frontend.finish()
@@ -176,7 +177,8 @@ def report(name: str, pairs: list[Pair], config: AlignmentConfig) -> None:
             after.append((pair.error(result.T_match_query), result.covariance))
     count = max(1, len(before))
     for what, rows in (("features", before), ("and surfaces", after)):
-        print(f"| {name} | {what} | {len(rows)} | {numbers_of(*map(list, zip(*rows, strict=True)))} |")
+        if rows:
+            print(f"| {name} | {what} | {len(rows)} | {numbers_of(*map(list, zip(*rows, strict=True)))} |")
     size = np.median([len(pair.query.depth) for pair in pairs])
     print(
         f"  {1e3 * spent / count:.1f} ms CPU per loop, {size / 1024:.1f} kB per keyframe, {refused:.0f} true refused,"

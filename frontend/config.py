@@ -94,6 +94,10 @@ class FrontendConfig(BaseModel):
     sift_pixels: int = Field(180_000, ge=10_000, description="larger images are reduced to so many pixels for SIFT")
     jpeg_quality: int = Field(85, ge=30, le=100, description="of the image that the map keeps")
     keyframe_depth_px: int = Field(
-        160, ge=0, le=1280, description="least width of the depth image that an RGB-D keyframe carries, 0 for none"
+        0,
+        ge=0,
+        le=1280,
+        description="least width of the depth image that an RGB-D keyframe carries, 0 for none; 160"
+        " lets surfaces refine and refuse loops",
     )
     thumbnail_px: int = Field(96, ge=16, le=640, description="longer side of the copy for colour histograms")

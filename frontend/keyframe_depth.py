@@ -39,7 +39,7 @@ def encode_depth(
     """Return a depth image (H, W), uint16 in 1 / ``depth_factor`` m or float32 in m, as a PNG of 16 bits.
 
     Its pixels are inverse depths in 1 / STEPS per metre, 0 where nothing is known or the ``mask`` (H, W) is zero.
-    NOTHING if the image is too small.
+    NOTHING if none is wanted or the image is too small.
     """
     inverse = reduce_depth(depth, depth_factor, config, mask)
     if inverse.size == 0:
@@ -71,6 +71,8 @@ def reduce_depth(
     depth: Depth, depth_factor: float, config: FrontendConfig, mask: NDArray[np.uint8] | None = None
 ) -> NDArray[np.float32]:
     """Return the inverse depth (h, w) in 1/m of squares of :func:`block_of` pixels, 0 where unknown."""
+    if config.keyframe_depth_px == 0:
+        return np.zeros((0, 0), np.float32)
     block = block_of(depth.shape[1], config.keyframe_depth_px)
     h, w = depth.shape[0] // block, depth.shape[1] // block
     if h == 0 or w == 0 or w < block:  # so that the block follows from both widths

@@ -157,8 +157,7 @@ class KeyframeBuilder:
 
     def _depth_of(self, frame: Frame) -> bytes:
         """Return the small depth image of a frame of a depth camera, nothing of others."""
-        wanted = self._mode is Mode.RGBD and self._config.keyframe_depth_px > 0
-        if not wanted or self._rig is None or frame.depth is None:
+        if self._mode is not Mode.RGBD or self._rig is None or frame.depth is None:
             return NOTHING
         return encode_depth(frame.depth, self._rig.depth_factor, self._config, frame.mask)
 

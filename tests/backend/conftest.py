@@ -158,7 +158,9 @@ def make_keyframe() -> Callable[[int], Keyframe]:
             previous_id=number - 1 if number else None,
             T_odom_cam=np.linalg.qr(w.rng.normal(size=(4, 4)))[0],
             covariance=np.diag(w.rng.random(6)),
-            depth=encode_depth(w.rng.uniform(1, 3, (48, 64)).astype(np.float32), 1.0, FrontendConfig()),
+            depth=encode_depth(
+                w.rng.uniform(1, 3, (48, 64)).astype(np.float32), 1.0, FrontendConfig(keyframe_depth_px=160)
+            ),
         )
 
     return make

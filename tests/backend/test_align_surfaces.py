@@ -54,7 +54,7 @@ def surface_at(planes: list, T_world_cam: NDArray[np.float64], rng: np.random.Ge
 
 
 def view(planes: list, T_world_cam: NDArray[np.float64], rng: np.random.Generator, **fields: object) -> Keyframe:
-    depth = encode_depth(depth_of(planes, T_world_cam, rng), 1.0, FrontendConfig())
+    depth = encode_depth(depth_of(planes, T_world_cam, rng), 1.0, FrontendConfig(keyframe_depth_px=160))
     values = {"id": 0, "session": 0, "index": 0, "stamp_ns": 0, "file": "a", "camera": CAMERA} | fields
     return Keyframe(
         features=Features.empty(),
@@ -212,7 +212,10 @@ def test_verification_goes_on_to_surfaces_unless_told_not_to(world, move) -> Non
     truth = move((0.01, 0.03, 0), (0.05, 0.02, 0.0))
     camera = replace(CAMERA, width=640, height=480, fx=500.0, fy=505.0, cx=320.0, cy=240.0)
     query, match = (
-        replace(scene.view(T, camera), depth=encode_depth(depth_of(ROOM, T, rng), 1.0, FrontendConfig()))
+        replace(
+            scene.view(T, camera),
+            depth=encode_depth(depth_of(ROOM, T, rng), 1.0, FrontendConfig(keyframe_depth_px=160)),
+        )
         for T in (truth, np.eye(4))
     )
     features = verify(query, match, VerificationConfig(), 3)

@@ -25,7 +25,7 @@ from seamark.frontend.keyframe_depth import encode_depth
 from seamark.frontend.types import Keyframe
 
 COUNT = 60
-DEPTH = encode_depth(np.full((24, 32), 2000, np.uint16), 1000.0, FrontendConfig())
+DEPTH = encode_depth(np.full((24, 32), 2000, np.uint16), 1000.0, FrontendConfig(keyframe_depth_px=160))
 PAGE = 4096
 
 

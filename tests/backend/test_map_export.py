@@ -145,7 +145,7 @@ def test_the_dense_point_cloud_is_the_wall_that_was_seen_in_its_colour(tmp_path,
     with MapStore(tmp_path / "map.seamark") as store:
         for number, T_map_cam in enumerate(T):
             depth = np.full((480, 640), 3 - T_map_cam[2, 3], np.float32)
-            png = encode_depth(depth, 1.0, FrontendConfig()) if number < 2 else b""
+            png = encode_depth(depth, 1.0, FrontendConfig(keyframe_depth_px=160)) if number < 2 else b""
             keyframe = replace(make_keyframe(number), T_odom_cam=T_map_cam, camera=ideal, jpeg=jpeg, depth=png)
             store.add_keyframe(keyframe)
         store.update_poses(MapSnapshot(1, np.arange(3), np.ones(3, int), np.ones(3, int), T, np.ones(3), ()))

@@ -116,7 +116,7 @@ def test_version_3_is_brought_up_to_date_and_takes_depth(tmp_path: Path) -> None
         MapStore(path, read_only=True)
     saved = repair_map(path, tmp_path / "new.seamark")
     assert (saved.damaged, saved.lost, saved.mended) == ([], [], [])
-    png = encode_depth(np.full((48, 64), 2000, np.uint16), 1000.0, FrontendConfig())
+    png = encode_depth(np.full((48, 64), 2000, np.uint16), 1000.0, FrontendConfig(keyframe_depth_px=160))
     for name in ("map.seamark", "new.seamark"):
         with MapStore(tmp_path / name) as store:
             assert store.keyframe_ids() == [0, 1, 3, 4, 5, 8, 9]

@@ -14,7 +14,7 @@ from seamark.frontend.keyframe_depth import STEPS, DepthError, decode_depth, enc
 from seamark.frontend.keyframes import KeyframeBuilder
 from seamark.frontend.types import Frame, Keyframe, Mode
 
-CONFIG = FrontendConfig()
+CONFIG = FrontendConfig(keyframe_depth_px=160)
 
 
 def by_squares(depth_m: np.ndarray, block: int) -> np.ndarray:
@@ -107,4 +107,4 @@ def test_keyframes_of_a_depth_camera_carry_it_and_others_do_not() -> None:
     np.testing.assert_allclose(carried, 1 / 1.5, atol=0.5 / STEPS)
     assert made(Mode.RGBD, None, CONFIG).depth == b""
     assert made(Mode.MONO, depth, CONFIG).depth == b""
-    assert made(Mode.RGBD, depth, FrontendConfig(keyframe_depth_px=0)).depth == b""
+    assert made(Mode.RGBD, depth, FrontendConfig()).depth == b""
