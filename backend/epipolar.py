@@ -1,0 +1,183 @@
+"""What two views without depth say of each other: which matches agree, and the pose up to its length.
+
+An essential matrix of known cameras holds the rotation between them and the direction in which one lies from the other.
+Both are refined on all matches that agree, and said only where the views settle them: without parallax there is no
+direction, and a plane has two poses that explain it alike.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from seamark.backend.config import VerificationConfig
+from seamark.backend.shared_errors import cells_of, independent_share
+from seamark.backend.verify_pose import usac_parameters
+from seamark.frontend import se3
+from seamark.frontend.camera import Camera
+
+Matrix = NDArray[np.float64]
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+STEPS: Final = 10
+CONVERGED: Final = 1e-7
+CAUCHY_WIDTH: Final = 2.5  # standard deviations
+PRIOR_FREEDOM: Final = 30.0
+# Rays nearer to each other than this, in standard deviations, are of something far away.
+COINCIDENT: Final = 3.0
+IN_FRONT: Final = 0.8  # of the matches
+# Noise alone looks like parallax and would hold a direction; what is shown must do so this many times better.
+PARALLAX: Final = 10.0
+ONE_PLANE: Final = 0.8  # of the matches: where one homography explains so many, two poses do
+MOST_BEARING_SIGMA: Final = float(np.deg2rad(10))
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """The pose between two cameras without its length.
+
+    ``R_match_query`` (3, 3), with ``rotation_covariance`` (3, 3) in the query's tangent space. ``bearing`` (3,): the unit
+    vector from the match's camera to the query's, in the match's frame, with ``bearing_sigma`` (rad) in its worst
+    direction; None and infinite where the views show too little parallax.
+    """
+
+    R_match_query: Matrix
+    rotation_covariance: Matrix
+    bearing: Array | None
+    bearing_sigma: float
+
+    @property
+    def rotation_sigma(self) -> float:
+        """Return the standard deviation of the rotation (rad) in its worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.rotation_covariance)[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Pixels (M, 2) of M matches; ideal ones where the ``cameras`` of query and match are known."""
+
+    query: Matrix
+    match: Matrix
+    cameras: tuple[Camera, Camera] | None
+
+    def some(self, chosen: Flags) -> "Views":
+        """Return these matches alone."""
+        return Views(self.query[chosen], self.match[chosen], self.cameras)
+
+
+def fit_epipolar(views: Views, config: VerificationConfig, seed: int) -> tuple[Matrix | None, Flags]:
+    """Return the essential matrix (the fundamental one without cameras) and which matches (M,) it explains; None where
+    there is none.
+    """
+    parameters = usac_parameters(config.epipolar_px, config, seed)
+    fit = partial(cv2.findFundamentalMat, views.query, views.match, parameters)
+    if views.cameras is not None:
+        K_query, K_match = (camera.K for camera in views.cameras)
+        fit = partial(cv2.findEssentialMat, views.query, views.match, K_query, K_match, None, None, parameters)
+    essential = views.cameras is not None
+    try:
+        model, mask = fit()
+    except cv2.error:
+        # OpenCV 5.0 asserts when its last refinement degenerates, as it does for two almost equal images.
+        limits = (config.epipolar_px, config.confidence, config.iterations)
+        model, mask = cv2.findFundamentalMat(views.query, views.match, cv2.FM_RANSAC, *limits)
+        essential = False
+    if model is None or mask is None or model.shape != (3, 3) or not np.isfinite(model).all():
+        return None, np.zeros(len(views.query), bool)
+    if views.cameras is not None and not essential:
+        model = K_match.T @ model @ K_query
+    return model, mask.reshape(-1).astype(bool)
+
+
+def direction_of(E: Matrix, views: Views, config: VerificationConfig) -> Direction | None:
+    """Return the pose up to its length that an essential matrix and the matches it explains hold.
+
+    None where they leave it open: behind the cameras, all on one plane, or too few for a sure rotation.
+    """
+    assert views.cameras is not None
+    rays_query, rays_match = (
+        np.column_stack([(uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(uv))])
+        for uv, camera in zip((views.query, views.match), views.cameras, strict=True)
+    )
+    start = _in_front(E, rays_query, rays_match, np.sqrt(2) * config.noise_px / views.cameras[1].fx)
+    if start is None:
+        return None
+    R, t = start
+    for _ in range(STEPS):
+        J, r, basis, _ = _system(R, t, rays_query, rays_match, views, config)
+        information = J.T @ J + 1e-9 * np.eye(5)
+        step = np.linalg.solve(information, -J.T @ r)
+        R, t = R @ se3.exp_rotation(step[:3]), t + basis @ step[3:]
+        t /= np.linalg.norm(t)
+        if np.abs(step).max() < CONVERGED:
+            break
+    return _sure(R, t, rays_query, rays_match, views, config)
+
+
+def _sure(
+    R: Matrix, t: Array, rays_query: Matrix, rays_match: Matrix, views: Views, config: VerificationConfig
+) -> Direction | None:
+    """Return what of a refined pose the matches hold."""
+    J, r, _, weights = _system(R, t, rays_query, rays_match, views, config)
+    scale = (PRIOR_FREEDOM + float((r**2).sum())) / (PRIOR_FREEDOM + max(float(weights.sum()) - 5, 0.0))
+    H = J.T @ J
+    if np.linalg.cond(H) > 1e9:
+        return None
+    covariance = np.linalg.inv(H) * scale
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    if 1 / sigma**2 < PARALLAX * float(weights.sum()) or _on_one_plane(views, config):
+        return None
+    found = Direction(R, 0.5 * (covariance + covariance.T)[:3, :3], t, sigma)
+    sure = np.rad2deg(found.rotation_sigma) < config.max_rotation_sigma_deg and sigma < MOST_BEARING_SIGMA
+    return found if sure else None
+
+
+def _in_front(E: Matrix, rays_query: Matrix, rays_match: Matrix, noise: float) -> tuple[Matrix, Array] | None:
+    """Return that one of the four poses of an essential matrix which has the matches ahead of both cameras."""
+    R1, R2, t = cv2.decomposeEssentialMat(E)
+    best, most = None, IN_FRONT * len(rays_query)
+    for R in (R1, R2):
+        turned = rays_query @ R.T
+        normal = np.cross(turned, rays_match)
+        square = (normal**2).sum(axis=1)
+        far = (np.sqrt(square) < COINCIDENT * noise * turned[:, 2]) & (turned[:, 2] > 0)
+        for way in (t[:, 0], -t[:, 0]):
+            in_match = (normal * np.cross(turned, way)).sum(axis=1) > 0
+            in_query = (normal * np.cross(rays_match, way)).sum(axis=1) > 0
+            ahead = int((far | (in_match & in_query)).sum())
+            if ahead >= most:
+                best, most = (R, way), ahead + 1
+    return best
+
+
+def _system(
+    R: Matrix, t: Array, rays_query: Matrix, rays_match: Matrix, views: Views, config: VerificationConfig
+) -> tuple[Matrix, Array, Matrix, Array]:
+    """Return the Jacobian (M, 5), rotation first, of the distances (M,) from the epipolar lines in standard deviations
+    (Sampson 1982), the basis (3, 2) of the bearing's tangent, and the weights (M,); weighed already.
+    """
+    assert views.cameras is not None
+    query, match = views.cameras
+    turned = rays_query @ R.T
+    line_match, line_query = np.cross(t, turned), np.cross(rays_match, t) @ R
+    spread = (line_match[:, 0] / match.fx) ** 2 + (line_match[:, 1] / match.fy) ** 2
+    spread += (line_query[:, 0] / query.fx) ** 2 + (line_query[:, 1] / query.fy) ** 2
+    whitening = 1 / (config.noise_px * np.sqrt(np.maximum(spread, 1e-18)))
+    basis = np.linalg.svd(t[None])[2][1:].T
+    r = whitening * (rays_match * line_match).sum(axis=1)
+    J = np.hstack([np.cross(rays_query, line_query), np.cross(turned, rays_match) @ basis]) * whitening[:, None]
+    weights = 1 / (1 + r**2 / CAUCHY_WIDTH**2)
+    weights *= independent_share(cells_of(views.match, match), config.shared_share)
+    root = np.sqrt(weights)
+    return J * root[:, None], r * root, basis, weights
+
+
+def _on_one_plane(views: Views, config: VerificationConfig) -> bool:
+    """Return whether one homography explains nearly all matches."""
+    limits = (cv2.RANSAC, config.reprojection_px, None, config.iterations, config.confidence)
+    found, mask = cv2.findHomography(views.query, views.match, *limits)
+    return found is not None and float(mask.mean()) >= ONE_PLANE
