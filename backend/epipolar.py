@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
+from seamark.backend.pose_errors import PoseSystem
 from seamark.backend.shared_errors import cells_of, independent_share
 from seamark.backend.verify_pose import usac_parameters
 from seamark.frontend import se3
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STEPS: Final = 10
+SQRT2: Final = float(np.sqrt(2.0))  # both views have a key point
 CONVERGED: Final = 1e-7
 CAUCHY_WIDTH: Final = 2.5  # standard deviations
 PRIOR_FREEDOM: Final = 30.0
@@ -40,20 +42,14 @@ MOST_BEARING_SIGMA: Final = float(np.deg2rad(10))
 class Direction:
     """The pose between two cameras without its length.
 
-    ``R_match_query`` (3, 3), with ``rotation_covariance`` (3, 3) in the query's tangent space. ``bearing`` (3,): the unit
-    vector from the match's camera to the query's, in the match's frame, with ``bearing_sigma`` (rad) in its worst
-    direction; None and infinite where the views show too little parallax.
+    ``R_match_query`` (3, 3); ``bearing`` (3,) is the unit vector from the match's camera to the query's, in the match's
+    frame. ``rotation_sigma`` and ``bearing_sigma`` (rad) are their standard deviations in their worst directions.
     """
 
     R_match_query: Matrix
-    rotation_covariance: Matrix
-    bearing: Array | None
+    bearing: Array
+    rotation_sigma: float
     bearing_sigma: float
-
-    @property
-    def rotation_sigma(self) -> float:
-        """Return the standard deviation of the rotation (rad) in its worst direction."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.rotation_covariance)[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +89,18 @@ def fit_epipolar(views: Views, config: VerificationConfig, seed: int) -> tuple[M
     return model, mask.reshape(-1).astype(bool)
 
 
-def direction_of(E: Matrix, views: Views, config: VerificationConfig) -> Direction | None:
-    """Return the pose up to its length that an essential matrix and the matches it explains hold.
+def direction_of(E: Matrix, views: Views, inliers: Flags, config: VerificationConfig) -> Direction | None:
+    """Return the pose up to its length that the matches hold, near an essential matrix that explains ``inliers`` (M,).
 
-    None where they leave it open: behind the cameras, all on one plane, or too few for a sure rotation.
+    Which matches belong to it is decided anew at each step, or those that a coarse matrix left out would be missed.
+    None where they leave it open: behind the cameras, all on one plane, with little parallax, or too few.
     """
     assert views.cameras is not None
     rays_query, rays_match = (
         np.column_stack([(uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(uv))])
         for uv, camera in zip((views.query, views.match), views.cameras, strict=True)
     )
-    start = _in_front(E, rays_query, rays_match, np.sqrt(2) * config.noise_px / views.cameras[1].fx)
+    start = _in_front(E, rays_query[inliers], rays_match[inliers], SQRT2 * config.noise_px / views.cameras[1].fx)
     if start is None:
         return None
     R, t = start
@@ -123,42 +120,52 @@ def _sure(
 ) -> Direction | None:
     """Return what of a refined pose the matches hold."""
     J, r, _, weights = _system(R, t, rays_query, rays_match, views, config)
-    scale = (PRIOR_FREEDOM + float((r**2).sum())) / (PRIOR_FREEDOM + max(float(weights.sum()) - 5, 0.0))
+    if np.count_nonzero(weights) < config.min_epipolar_inliers:
+        return None
+    # Only upwards: what lies beyond the limit was left out, so that the rest seems better than it is.
+    scale = max((PRIOR_FREEDOM + float((r**2).sum())) / (PRIOR_FREEDOM + max(float(weights.sum()) - 5, 0.0)), 1.0)
     H = J.T @ J
     if np.linalg.cond(H) > 1e9:
         return None
-    covariance = np.linalg.inv(H) * scale
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
-    if 1 / sigma**2 < PARALLAX * float(weights.sum()) or _on_one_plane(views, config):
+    # As for poses with depth: no single match, which may be a wrong one near a line, is to hold what is claimed.
+    left = PoseSystem(J, r, np.arange(len(r)), scale, config.shared_share).without_one(np.ones(5))
+    turn, way = (float(np.sqrt(np.linalg.eigvalsh(left[:, one, one])[:, -1].max())) for one in (slice(3), slice(3, 5)))
+    if 1 / way**2 < PARALLAX * float(weights.sum()) or _on_one_plane(views.some(weights > 0), config):
         return None
-    found = Direction(R, 0.5 * (covariance + covariance.T)[:3, :3], t, sigma)
-    sure = np.rad2deg(found.rotation_sigma) < config.max_rotation_sigma_deg and sigma < MOST_BEARING_SIGMA
-    return found if sure else None
+    sure = np.rad2deg(turn) < config.max_rotation_sigma_deg and way < MOST_BEARING_SIGMA
+    return Direction(R, t, turn, way) if sure else None
 
 
 def _in_front(E: Matrix, rays_query: Matrix, rays_match: Matrix, noise: float) -> tuple[Matrix, Array] | None:
     """Return that one of the four poses of an essential matrix which has the matches ahead of both cameras."""
     R1, R2, t = cv2.decomposeEssentialMat(E)
-    best, most = None, IN_FRONT * len(rays_query)
+    best, most = None, 0
     for R in (R1, R2):
-        turned = rays_query @ R.T
-        normal = np.cross(turned, rays_match)
-        square = (normal**2).sum(axis=1)
-        far = (np.sqrt(square) < COINCIDENT * noise * turned[:, 2]) & (turned[:, 2] > 0)
         for way in (t[:, 0], -t[:, 0]):
-            in_match = (normal * np.cross(turned, way)).sum(axis=1) > 0
-            in_query = (normal * np.cross(rays_match, way)).sum(axis=1) > 0
-            ahead = int((far | (in_match & in_query)).sum())
-            if ahead >= most:
-                best, most = (R, way), ahead + 1
+            far, ahead = _ahead(rays_query @ R.T, rays_match, way, noise)
+            near = len(far) - int(far.sum())
+            if ahead.sum() > most and (far | ahead).mean() >= IN_FRONT and (ahead & ~far).sum() >= IN_FRONT * near:
+                best, most = (R, way), int(ahead.sum())
     return best
+
+
+def _ahead(turned: Matrix, rays_match: Matrix, t: Array, noise: float) -> tuple[Flags, Flags]:
+    """Return which rays (M, 3), the query's ``turned`` into the match, show no parallax, as far away, and which meet
+    ahead of both cameras.
+    """
+    normal = np.cross(turned, rays_match)
+    far = (np.linalg.norm(normal, axis=1) < COINCIDENT * noise * turned[:, 2]) & (turned[:, 2] > 0)
+    in_match = (normal * np.cross(turned, t)).sum(axis=1) > 0
+    in_query = (normal * np.cross(rays_match, t)).sum(axis=1) > 0
+    return np.asarray(far), np.asarray(in_match & in_query)
 
 
 def _system(
     R: Matrix, t: Array, rays_query: Matrix, rays_match: Matrix, views: Views, config: VerificationConfig
 ) -> tuple[Matrix, Array, Matrix, Array]:
     """Return the Jacobian (M, 5), rotation first, of the distances (M,) from the epipolar lines in standard deviations
-    (Sampson 1982), the basis (3, 2) of the bearing's tangent, and the weights (M,); weighed already.
+    (Sampson 1982), the basis (3, 2) of the bearing's tangent, and the weights (M,), 0 for
+    those that do not belong to it; weighed already.
     """
     assert views.cameras is not None
     query, match = views.cameras
@@ -171,7 +178,10 @@ def _system(
     r = whitening * (rays_match * line_match).sum(axis=1)
     J = np.hstack([np.cross(rays_query, line_query), np.cross(turned, rays_match) @ basis]) * whitening[:, None]
     weights = 1 / (1 + r**2 / CAUCHY_WIDTH**2)
-    weights *= independent_share(cells_of(views.match, match), config.shared_share)
+    near = np.abs(r) * config.noise_px < config.epipolar_px
+    near &= np.logical_or(*_ahead(turned, rays_match, t, SQRT2 * config.noise_px / match.fx))
+    weights[near] *= independent_share(cells_of(views.match[near], match), config.shared_share)
+    weights[~near] = 0
     root = np.sqrt(weights)
     return J * root[:, None], r * root, basis, weights
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.epipolar import Direction
 from seamark.backend.errors import MapCorruptError
 
 VERSION = 1
+DIRECTION_NUMBERS = 14  # R_match_query by rows, bearing, two deviations
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Evidence:
     ``pixels`` (M, 4) float32 are the matches (x, y in the query, x, y in the match), as seen. ``inliers`` (M,) bool
     those that the geometry explains. ``missing`` (K, 2) float32 are pixels of the query where a landmark of the match
     should be and is not. ``gates`` come in the order in which they were tried, the last one failed or none did.
+    ``direction`` is the pose up to its length, where epipolar geometry alone has spoken and holds it.
     """
 
     pixels: NDArray[np.float32]
@@ -41,6 +44,7 @@ class Evidence:
     gates: tuple[Gate, ...] = ()
     reprojection_px: float = float("nan")
     missing: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    direction: Direction | None = None
 
     def gate(self, name: str) -> Gate | None:
         """Return the gate of this name, None where it was not tried."""
@@ -56,6 +60,8 @@ def encode_evidence(evidence: Evidence) -> bytes:
         "matches": len(evidence.pixels),
         "missing": len(evidence.missing),
     }
+    if evidence.direction is not None:
+        facts["direction"] = _direction_as_numbers(evidence.direction)
     header = json.dumps(facts).encode() + b"\n"
     arrays = (_fixed_point(evidence.pixels), np.packbits(evidence.inliers), _fixed_point(evidence.missing))
     return zlib.compress(header + b"".join(array.tobytes() for array in arrays), 6)
@@ -78,9 +84,22 @@ def decode_evidence(blob: bytes) -> Evidence:
         gates = tuple(
             Gate(str(name), float(value), float(limit), bool(least)) for name, value, limit, least in facts["gates"]
         )
-        return Evidence(pixels, inliers, gates, float(facts["reprojection_px"]), absent)
+        direction = _direction_of_numbers(facts["direction"]) if "direction" in facts else None
+        return Evidence(pixels, inliers, gates, float(facts["reprojection_px"]), absent, direction)
     except (zlib.error, ValueError, KeyError, TypeError) as error:
         raise MapCorruptError(f"the evidence of a loop is damaged: {error}") from error
+
+
+def _direction_as_numbers(direction: Direction) -> list[float]:
+    parts = direction.R_match_query.reshape(-1), direction.bearing
+    return [*np.concatenate(parts).tolist(), direction.rotation_sigma, direction.bearing_sigma]
+
+
+def _direction_of_numbers(numbers: list[float]) -> Direction:
+    if len(numbers) != DIRECTION_NUMBERS:
+        raise ValueError("direction")
+    values = np.array(numbers, np.float64)
+    return Direction(values[:9].reshape(3, 3), values[9:12], float(values[12]), float(values[13]))
 
 
 def _fixed_point(pixels: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -6,6 +6,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from seamark.backend.epipolar import Direction
 from seamark.backend.evidence import Evidence
 
 Matrix = NDArray[np.float64]
@@ -73,7 +74,8 @@ class Place:
 
     ``inliers`` is 0 where geometry was not tried or failed. ``T_map_cam`` is the query camera's pose in the map, None
     when it was not localised. ``view`` is the likeness of the edges of the whole images, 0..1, ``probability`` that of
-    both showing one place, by looks alone.
+    both showing one place, by looks alone. ``direction``: how the query lies to keyframe ``keyframe_id``, but for the
+    distance, where no depth told more.
     """
 
     keyframe_id: int
@@ -89,3 +91,4 @@ class Place:
     T_map_cam: Matrix | None = None
     view: float = 0.0
     probability: float = 0.0
+    direction: Direction | None = None

@@ -1,21 +1,21 @@
 """Geometric verification: do two keyframes show the same place, and how do their cameras lie to each other?"""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
+from seamark.backend.coverage import coverage
+from seamark.backend.epipolar import Direction, Views, direction_of, fit_epipolar
 from seamark.backend.evidence import Evidence, Gate
 from seamark.backend.far_landmarks import Landmarks, measured_landmarks
 from seamark.backend.matching import Matches, match_features
 from seamark.backend.pose_errors import Observations
 from seamark.backend.refine_pose import RefinedPose, explained_without_depth, refine, worst_deviations
 from seamark.backend.types import Reason
-from seamark.backend.verify_pose import Hypothesis, estimate_pose, estimate_scale, usac_parameters
+from seamark.backend.verify_pose import Hypothesis, estimate_pose, estimate_scale
 from seamark.backend.visibility import Sight, look
 from seamark.frontend import se3
 from seamark.frontend.types import Keyframe
@@ -24,7 +24,6 @@ Matrix = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 FarLandmarks = Callable[[Keyframe], Landmarks]
 
-SPREAD_CELLS = (8, 6)
 NEARLY_ALL = 0.8
 FARTHER = 1.25  # times as many matches must have a landmark to try again
 CLOSE_DESCRIPTORS = 60.0  # of 512: two that differ by less are of one thing, however alike the other matches are
@@ -46,6 +45,11 @@ class Verification:
     scale: float = 1.0
     scale_sigma: float = 1e-3
     evidence: Evidence | None = None
+
+    @property
+    def direction(self) -> Direction | None:
+        """Return the pose without its length, where there is no other and the views hold this one."""
+        return None if self.evidence is None else self.evidence.direction
 
 
 @dataclass(frozen=True)
@@ -261,52 +265,37 @@ def _look(trial: _Trial, refined: RefinedPose, in_query_units: bool) -> Sight:
 
 
 def _verify_epipolar(trial: _Trial, seed: int) -> Verification | Rejected:
-    """Fit the essential (calibrated) or fundamental matrix and count what it explains; there is no metric pose."""
+    """Fit the essential (calibrated) or fundamental matrix and count what it explains: a direction at most."""
     query, match, config = trial.query, trial.match, trial.config
     points_query = query.features.points[trial.matches.query].astype(np.float64)
     points_match = match.features.points[trial.matches.match].astype(np.float64)
-    parameters = usac_parameters(config.epipolar_px, config, seed)
+    views = Views(points_query, points_match, None)
     if query.camera is not None and match.camera is not None:
-        points_query, points_match = query.camera.undistort(points_query), match.camera.undistort(points_match)
-        K = (query.camera.K, match.camera.K)
-        fit = partial(cv2.findEssentialMat, points_query, points_match, *K, None, None, parameters)
-    else:
-        fit = partial(cv2.findFundamentalMat, points_query, points_match, parameters)
-    try:
-        model, mask = fit()
-    except cv2.error:
-        # OpenCV 5.0 asserts when its last refinement degenerates, as it does for two almost equal images.
-        limits = (config.epipolar_px, config.confidence, config.iterations)
-        model, mask = cv2.findFundamentalMat(points_query, points_match, cv2.FM_RANSAC, *limits)
-    if model is not None and mask is not None and model.shape == (3, 3) and np.isfinite(model).all():
-        trial.inliers = mask.reshape(-1).astype(bool)
+        cameras = query.camera, match.camera
+        views = Views(cameras[0].undistort(points_query), cameras[1].undistort(points_match), cameras)
+    model, trial.inliers = fit_epipolar(views, config, seed)
     if not trial.passes("epipolar_inliers", trial.count, config.min_epipolar_inliers):
         return trial.rejected(Reason.FEW_INLIERS)
     if not trial.passes("epipolar_ratio", trial.count / len(trial.matches), config.min_epipolar_ratio):
         return trial.rejected(Reason.FEW_INLIERS)
     if not _well_spread(trial):
         return trial.rejected(Reason.BAD_GEOMETRY)
-    return Verification(trial.count, len(trial.matches), scale_sigma=float("inf"), evidence=trial.evidence())
+    evidence = trial.evidence()
+    if model is not None and views.cameras is not None:
+        evidence = replace(evidence, direction=direction_of(model, views, trial.inliers, config))
+    return Verification(trial.count, len(trial.matches), scale_sigma=float("inf"), evidence=evidence)
 
 
 def _well_spread(trial: _Trial) -> bool:
     """Return whether the inliers neither crowd in one spot nor lie on a line, in both images."""
-    sides = (
+    config = trial.config
+    for name, keyframe, indices in (
         ("query", trial.query, trial.matches.query[trial.inliers]),
         ("match", trial.match, trial.matches.match[trial.inliers]),
-    )
-    for name, keyframe, indices in sides:
-        points = keyframe.features.points
-        size = np.ptp(points, axis=0).astype(np.float64) + 1.0
-        origin = points.min(axis=0).astype(np.float64)
-        if keyframe.camera is not None:
-            size, origin = np.array([keyframe.camera.width, keyframe.camera.height], np.float64), np.zeros(2)
-        seen = points[indices]
-        cells = np.clip((seen - origin) / size * SPREAD_CELLS, 0, np.array(SPREAD_CELLS) - 1).astype(np.int64)
-        if not trial.passes(f"cells_{name}", len(np.unique(cells, axis=0)), trial.config.min_cells):
+    ):
+        cells, hull = coverage(keyframe.features.points, keyframe.features.points[indices], keyframe.camera)
+        if not trial.passes(f"cells_{name}", cells, config.min_cells):
             return False
-        hull = cv2.convexHull(np.ascontiguousarray(seen, np.float32))
-        share = cv2.contourArea(hull) / (size[0] * size[1])
-        if not trial.passes(f"hull_{name}", share, trial.config.min_hull_fraction):
+        if not trial.passes(f"hull_{name}", hull, config.min_hull_fraction):
             return False
     return True

@@ -153,4 +153,5 @@ class CandidateVerifier:
             T_map_cam=T_map_cam,
             view=candidate.view,
             probability=probability(query, match, candidate.score),
+            direction=result.direction if isinstance(result, Verification) else None,
         )

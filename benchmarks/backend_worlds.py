@@ -193,6 +193,8 @@ def false_loops(made: Replay, clean: Run, share: float, consistent: bool, seed: 
             query, match = first + step, target + step
             if query >= count or added >= wanted:
                 break
+            if any(candidate.id == match for candidate, _ in out.get(query, [])):
+                continue
             like = pool[int(rng.integers(len(pool)))]
             noise = rng.multivariate_normal(np.zeros(6), like.covariance)
             T = se3.inverse(made.T_world_cam[match]) @ G @ made.T_world_cam[query]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from seamark.backend.evidence import Evidence
 from seamark.backend.explain import Explanation
 from seamark.frontend.types import Keyframe
+from seamark.service.directions import direction_facts
 from seamark.service.picture import ACCEPTED, DPI, GREY, INK
 
 REFUSED = "#dc2626"
@@ -131,6 +132,8 @@ def facts_of(found: Explanation) -> list[tuple[str, str]]:
     ]
     if found.evidence is not None and np.isfinite(found.evidence.reprojection_px):
         rows.append(("median error", f"{found.evidence.reprojection_px:.2f} px"))
+    if found.evidence is not None and found.evidence.direction is not None:
+        rows += direction_facts(found.evidence.direction)
     if loop.T_match_query is not None:
         x, y, z = loop.T_match_query[:3, 3]
         rows.append(("query in the match's frame", f"x {x:.3f}, y {y:.3f}, z {z:.3f}"))

@@ -12,6 +12,7 @@ from seamark.backend.explain import Explanation
 from seamark.backend.map_store import Verdict
 from seamark.backend.types import Loop
 from seamark.frontend.types import Keyframe
+from seamark.service.directions import direction_as_json
 from seamark.service.loop_picture import facts_of
 
 
@@ -66,6 +67,7 @@ def explanation_as_json(found: Explanation) -> dict[str, Any]:
             for entry in found.history
         ],
         "gates": [],
+        "direction": None,
         "reprojection_px": None,
         "matches": [],
         "missing": [],
@@ -81,6 +83,8 @@ def explanation_as_json(found: Explanation) -> dict[str, Any]:
             }
             for gate in evidence.gates
         ]
+        if evidence.direction is not None:
+            out["direction"] = direction_as_json(evidence.direction)
         out["reprojection_px"] = _number(evidence.reprojection_px)
         pairs = zip(evidence.pixels.tolist(), evidence.inliers.tolist(), strict=True)
         out["matches"] = [[*pixels, inlier] for pixels, inlier in pairs]

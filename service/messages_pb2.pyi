@@ -288,8 +288,20 @@ class PlaceQuery(_message.Message):
     camera: Camera
     def __init__(self, schema_version: _Optional[int] = ..., image: _Optional[bytes] = ..., top_k: _Optional[int] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ...) -> None: ...
 
+class Direction(_message.Message):
+    __slots__ = ("R_match_query", "bearing", "rotation_sigma", "bearing_sigma")
+    R_MATCH_QUERY_FIELD_NUMBER: _ClassVar[int]
+    BEARING_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    BEARING_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    R_match_query: Array
+    bearing: Array
+    rotation_sigma: float
+    bearing_sigma: float
+    def __init__(self, R_match_query: _Optional[_Union[Array, _Mapping]] = ..., bearing: _Optional[_Union[Array, _Mapping]] = ..., rotation_sigma: _Optional[float] = ..., bearing_sigma: _Optional[float] = ...) -> None: ...
+
 class Place(_message.Message):
-    __slots__ = ("keyframe_id", "session", "stamp_ns", "file", "score", "votes", "jeffrey", "inliers", "accepted", "reason", "T_map_cam", "view", "probability")
+    __slots__ = ("keyframe_id", "session", "stamp_ns", "file", "score", "votes", "jeffrey", "inliers", "accepted", "reason", "T_map_cam", "view", "probability", "direction")
     KEYFRAME_ID_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
@@ -303,6 +315,7 @@ class Place(_message.Message):
     T_MAP_CAM_FIELD_NUMBER: _ClassVar[int]
     VIEW_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
     keyframe_id: int
     session: int
     stamp_ns: int
@@ -316,7 +329,8 @@ class Place(_message.Message):
     T_map_cam: Array
     view: float
     probability: float
-    def __init__(self, keyframe_id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., score: _Optional[float] = ..., votes: _Optional[float] = ..., jeffrey: _Optional[float] = ..., inliers: _Optional[int] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., T_map_cam: _Optional[_Union[Array, _Mapping]] = ..., view: _Optional[float] = ..., probability: _Optional[float] = ...) -> None: ...
+    direction: Direction
+    def __init__(self, keyframe_id: _Optional[int] = ..., session: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., file: _Optional[str] = ..., score: _Optional[float] = ..., votes: _Optional[float] = ..., jeffrey: _Optional[float] = ..., inliers: _Optional[int] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., T_map_cam: _Optional[_Union[Array, _Mapping]] = ..., view: _Optional[float] = ..., probability: _Optional[float] = ..., direction: _Optional[_Union[Direction, _Mapping]] = ...) -> None: ...
 
 class PlaceReply(_message.Message):
     __slots__ = ("schema_version", "places", "error_code", "error_message", "timings_ms", "verdict")

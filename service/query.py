@@ -8,6 +8,7 @@ from rich.table import Table
 
 from seamark import SeamarkError
 from seamark.service import topics
+from seamark.service.directions import describe_direction, direction_as_json
 from seamark.service.requests import PlaceQuery, PlaceReply
 from seamark.service.results import pose_fields
 from seamark.service.stamps import format_stamp
@@ -51,6 +52,7 @@ def as_json(reply: PlaceReply) -> dict[str, Any]:
             "T_map_cam": dict(zip(("tx", "ty", "tz", "qx", "qy", "qz", "qw"), map(float, pose), strict=True))
             if pose
             else None,
+            "direction": None if place.direction is None else direction_as_json(place.direction),
         }
         del row["stamp_ns"]
         places.append(row)
@@ -65,7 +67,9 @@ def table(reply: PlaceReply) -> Table:
     for column in ("rank", "file", "stamp", "score", "votes", "jeffrey", "inliers", "verdict", "position in the map"):
         out.add_column(column)
     for rank, place in enumerate(reply.places, start=1):
-        position = "" if place.T_map_cam is None else "{:.3f} {:.3f} {:.3f}".format(*place.T_map_cam[:3, 3])
+        position = "" if place.direction is None else describe_direction(place.direction)
+        if place.T_map_cam is not None:
+            position = "{:.3f} {:.3f} {:.3f}".format(*place.T_map_cam[:3, 3])
         verdict = "yes" if place.accepted else str(place.reason)
         out.add_row(
             str(rank),

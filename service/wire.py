@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 from google.protobuf.message import DecodeError, Message
 
 from seamark import SeamarkError
+from seamark.backend.epipolar import Direction
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Loss, Odometry, Outcome, Quality
 from seamark.service import messages_pb2 as pb
@@ -155,12 +156,23 @@ _LOOP = Schema(
     | {"T_match_query": Optional(_POSE), "covariance": Optional(_COVARIANCE), "scale": Number()},
     Loop,
 )
+_DIRECTION = Schema(
+    pb.Direction,
+    {
+        "R_match_query": Array(("float64",), (3, 3)),
+        "bearing": Array(("float64",), (3,)),
+        "rotation_sigma": Number(),
+        "bearing_sigma": Number(),
+    },
+    Direction,
+)
 _PLACE = Schema(
     pb.Place,
     {"keyframe_id": Integer(), "session": Integer(), "stamp_ns": Integer(), "file": Text()}
     | _VERDICT
     | _EVIDENCE
-    | {"T_map_cam": Optional(_POSE), "view": Number(), "probability": Number()},
+    | {"T_map_cam": Optional(_POSE), "view": Number(), "probability": Number()}
+    | {"direction": Optional(Nested(_DIRECTION))},
     Place,
 )
 _COLOUR = Array(("uint8",), (None, None), (None, None, 3))

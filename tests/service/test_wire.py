@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from seamark.backend.epipolar import Direction
 from seamark.backend.types import Loop, MapSnapshot, Place, Reason
 from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Odometry, Outcome, Quality
 from seamark.service import messages_pb2 as pb
@@ -81,6 +82,7 @@ def messages() -> list[Any]:
         4, *(np.arange(2) + k for k in range(3)), np.full((2, 4, 4), np.nan), np.ones(2), (loop(), loop(False))
     )
     empty_map = MapSnapshot(0, *(np.zeros(0, np.int64),) * 3, np.zeros((0, 4, 4)), np.zeros(0), ())
+    direction = Direction(np.eye(3), np.array([0.0, 0.6, 0.8]), 0.01, 0.02)
     bare = dataclasses.replace(
         keyframe(),
         features=Features.empty(),
@@ -115,7 +117,10 @@ def messages() -> list[Any]:
         PlaceQuery(b"image", 3, Camera(64, 48, 50, 50, 32, 24)),
         PlaceQuery(b"", 1),
         PlaceReply(
-            (Place(1, 0, 5, "a", 0.5, 0.4, 0.1, 30, True, Reason.ACCEPTED, np.eye(4), 0.4, 0.99),),
+            (
+                Place(1, 0, 5, "a", 0.5, 0.4, 0.1, 30, True, Reason.ACCEPTED, np.eye(4), 0.4, 0.99),
+                Place(2, 0, 5, "b", 0.5, 0.4, 0.1, 30, True, Reason.ACCEPTED, direction=direction),
+            ),
             timings_ms={"sift": 9.5},
             verdict=Verdict.ACCEPTED,
         ),
