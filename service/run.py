@@ -28,6 +28,7 @@ from seamark.service.types import KeyframeSummary, ProcessUsage, RunRecord
 
 MAP_FILE = "map.seamark"
 RECORDING_FILE = "run.rrd"
+PASSING_FILE = "passing.seamark"  # keyframes of a run that leaves no map, until it ends
 NO_TRACKS = np.zeros((0, 4), np.float32)
 
 Progress = Callable[[int, int | None, Odometry], None]
@@ -76,10 +77,12 @@ def run(source: Source, options: RunOptions, config: SeamarkConfig, progress: Pr
             map_path=map_path,
             no_loops=not options.loops,
             localise_only=options.localise_only,
-            passing=options.localise_only,
+            passing_path=output.staging / PASSING_FILE if options.localise_only else None,
             solver_process=not options.in_process,
         )
         record = _run_nodes(source, options, settings, output, progress)
+        for passing in output.staging.glob(f"{PASSING_FILE}*"):
+            passing.unlink()
         write_files(record, output.staging, settings.config)
         output.commit()
     return record

@@ -10,7 +10,7 @@ import numpy as np
 from seamark.backend.config import MapConfig
 from seamark.backend.errors import MapError
 from seamark.backend.graph_types import Solver
-from seamark.backend.map_open import loader, restore
+from seamark.backend.map_open import loader, open_passing, restore
 from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam, StepResult
 from seamark.backend.solver import SolverProcess
@@ -40,7 +40,8 @@ class BackendNode:
 
     A keyframe is acknowledged when it is on disk, candidates when their keyframe has been mapped. With ``no_loops``
     candidates are ignored. What ``store`` holds already is taken in first. ``solver`` is closed with the node.
-    ``patient``, ``frozen`` and ``passing``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`.
+    ``patient`` and ``frozen``: see :class:`~seamark.service.nodes.map_keeper.MapKeeper`. With ``passing`` keyframes go
+    to that file (see :func:`~seamark.backend.map_open.open_passing`) and ``store`` stays as it is.
     """
 
     def __init__(
@@ -55,16 +56,17 @@ class BackendNode:
         solver: Solver | None = None,
         patient: bool = False,
         frozen: bool = False,
-        passing: bool = False,
+        passing: MapStore | None = None,
         limits: MapConfig | None = None,
     ) -> None:
         self._bus, self._slam, self._no_loops, self._solver = bus, slam, no_loops, solver
         self._meter = Meter(bus.node)
         self._keeper = None
         if store is not None:
-            self._keeper = MapKeeper(store, self._meter, patient=patient, frozen=frozen, passing=passing)
+            self._keeper = MapKeeper(passing or store, self._meter, patient=patient, frozen=frozen and passing is None)
+        self._store = store
         self._pruner = None
-        if self._keeper is not None:
+        if self._keeper is not None and passing is None:
             self._pruner = MapPruner(self._keeper, slam, limits or MapConfig(), self._meter, self._forget)
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
@@ -74,7 +76,7 @@ class BackendNode:
         self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
         self._candidates: dict[int, tuple[Candidates, Future[None]]] = {}
         if store is not None:
-            self._restore(store, held=passing)
+            self._restore(store, passing)
         place_service = PlaceService(places, camera, self._rank, slam.locate)
         bus.handle(topics.DRAIN[bus.node], self._on_drain)
         bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
@@ -116,12 +118,17 @@ class BackendNode:
         """Close the map's file and end the solver."""
         if self._keeper is not None:
             self._keeper.close()
+        if self._store is not None:
+            self._store.close()
         if self._solver is not None:
             self._solver.close()
 
-    def _restore(self, store: MapStore, held: bool) -> None:
+    def _restore(self, store: MapStore, passing: MapStore | None) -> None:
         """Take in the map from before; keyframes stored and not yet mapped wait for their candidates again."""
-        before, waiting = restore(self._slam, store, held=held)
+        before, waiting = restore(self._slam, store, held=passing is not None)
+        if passing is not None:
+            own, waiting_own = restore(self._slam, passing, solve=True)
+            before, waiting = before + own, waiting + waiting_own
         for keyframe in (*before, *waiting):
             self._remember(keyframe)
         self._waiting |= {keyframe.id: keyframe for keyframe in waiting}
@@ -239,14 +246,16 @@ class BackendNode:
 def build(bus: Bus, settings: NodeSettings) -> BackendNode:
     """Return the node for the settings; raises MapError and its kin when the map cannot be used."""
     config, mode = settings.config, settings.mode
-    store = open_map(settings)
+    store, passing = open_map(settings), None
     solver: Solver | None = None
     try:
+        if settings.passing_path is not None:
+            passing = open_passing(settings.passing_path)
         if mode is not Mode.PLACES:
             solver = _solver(settings)
         return BackendNode(
             bus,
-            Slam(config.backend, mode, solver, config.seed, None if store is None else loader(store)),
+            Slam(config.backend, mode, solver, config.seed, None if store is None else loader(store, passing)),
             store,
             config.frontend,
             settings.rig.cam0 if settings.rig else None,
@@ -254,14 +263,15 @@ def build(bus: Bus, settings: NodeSettings) -> BackendNode:
             solver=solver,
             patient=settings.patient,
             frozen=settings.localise_only,
-            passing=settings.passing,
+            passing=passing,
             limits=config.backend.map,
         )
     except BaseException:
         if solver is not None:
             solver.close()
-        if store is not None:
-            store.close()
+        for opened in (passing, store):
+            if opened is not None:
+                opened.close()
         raise
 
 

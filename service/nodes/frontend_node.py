@@ -193,7 +193,7 @@ def build(bus: Bus, settings: NodeSettings) -> FrontendNode:
         first_keyframe_id=settings.first_keyframe_id,
         first_session=settings.first_session,
         patient=settings.patient,
-        learning=settings.passing or not settings.localise_only,
+        learning=settings.passing_path is not None or not settings.localise_only,
     )
 
 

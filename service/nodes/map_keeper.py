@@ -28,14 +28,12 @@ class MapKeeper:
     ``patient``: a disk that takes no more (full, read-only, failing) stops learning and nothing else. Keyframes are
     refused as BUSY, so that their sender keeps them and sends them again; what was found out is kept and tried again
     every RETRY_EVERY_S, and is acknowledged once it is on disk. Not ``patient``, the MapUnwritableError is raised.
-    With ``frozen`` nothing is ever written and keyframes are refused for good, or, with ``passing``, taken in memory.
+    With ``frozen`` nothing is ever written and keyframes are refused for good.
     """
 
-    def __init__(
-        self, store: MapStore, meter: Meter, *, patient: bool = False, frozen: bool = False, passing: bool = False
-    ) -> None:
+    def __init__(self, store: MapStore, meter: Meter, *, patient: bool = False, frozen: bool = False) -> None:
         self.store = store
-        self._meter, self._patient, self._frozen, self._passing = meter, patient, frozen, frozen and passing
+        self._meter, self._patient, self._frozen = meter, patient, frozen
         self._lock = threading.RLock()
         self._loops: dict[tuple[int, int], Loop] = {}  # not yet on disk, and so on
         self._snapshot: MapSnapshot | None = None
@@ -49,8 +47,6 @@ class MapKeeper:
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Write a keyframe; raises RemoteError (BUSY) while a patient keeper cannot, MapError for good reasons."""
-        if self._passing:
-            return
         if self._frozen:
             raise MapError("this service localises only and learns nothing")
         with self._lock:

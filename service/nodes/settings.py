@@ -16,8 +16,9 @@ class NodeSettings:
     puts the pose graph's solver into a process of its own, so that queries stay answered while it works. ``restore``
     tells the vocabulary that there is a map to take places from; the back end, which owns the file, always looks.
     ``localise_only`` opens the map for reading and leaves it as it is: queries are answered, nothing is learned.
-    With ``passing`` a session in such a map gets poses in it nevertheless: it is kept in memory and goes with the
-    service. ``patient`` lets the back end wait for a disk that takes no more, where a run would end.
+    With ``passing_path`` sessions in such a map get poses in it nevertheless: what is learned of them is kept in that
+    file, which is nobody's map, and survives a node that dies. ``patient`` lets the back end wait for a disk that takes
+    no more, where a run would end.
     """
 
     mode: Mode
@@ -34,5 +35,5 @@ class NodeSettings:
     restore: bool = False
     patient: bool = False
     localise_only: bool = False
-    passing: bool = False
+    passing_path: Path | None = None
     log_level: str = "WARNING"

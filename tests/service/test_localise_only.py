@@ -1,6 +1,8 @@
 """Localisation only: the service answers from the map and leaves it as it is, to the byte."""
 
 import csv
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,6 +81,49 @@ def test_a_run_that_only_localises_finds_its_frames_in_an_old_map(tmp_path: Path
     assert len(here) == len(there) == 40
     apart = np.linalg.norm(here.T_world_cam[:, :3, 3] - there.T_world_cam[:, :3, 3], axis=1)
     assert 0 < apart.max() < 0.05
+
+
+@pytest.mark.zenoh
+def test_a_back_end_that_dies_takes_nothing_of_a_passing_session_with_it(tmp_path: Path) -> None:
+    """Test: the back end is killed in the midst of the same way through an old map. Expected: all keyframes, at the
+    poses that the old ones of the same frames have, and loops from before the kill and after it.
+    """
+    config = load_config(overrides=["frontend.keyframe_parallax_px=8", "service.record=false"])
+    sequence, options = (
+        toy_sequence("loop", 40, SEED, Mode.RGBD),
+        RunOptions(tmp_path / "old", ("toy",), in_process=True),
+    )
+    first = run(sequence, options, config).snapshot
+    path, count, before = tmp_path / "old" / "map.seamark", len(first.keyframe_ids), contents(tmp_path / "old")
+    settings = NodeSettings(
+        Mode.RGBD,
+        ToyWorld(SEED).rig(Mode.RGBD),
+        config,
+        map_path=path,
+        localise_only=True,
+        passing_path=tmp_path / "passing",
+        log_level="ERROR",
+    )
+    odometry = []
+    with Launcher(settings) as launcher:
+        for frame in toy_sequence("loop", 40, SEED, Mode.RGBD).frames():
+            if frame.index == 25:
+                killed_at = max(one.keyframe_id or 0 for one in odometry)
+                os.kill(launcher.process_id("backend"), signal.SIGKILL)
+            odometry.append(launcher.bus.request(topics.FRAME, frame, 60.0))
+        launcher.wait_until_alive()
+        for node in topics.NODES:
+            launcher.bus.request(topics.DRAIN[node], Empty(), 60.0)
+        found = launcher.bus.request(topics.MAP_SNAPSHOT, Empty())
+        assert launcher.restarts["backend"] == 1
+    own = [one.keyframe_id for one in odometry if one.keyframe_id is not None]
+    assert found.keyframe_ids.tolist() == [*range(count), *own] and len(own) == count
+    assert set(found.components.tolist()) == {0}
+    np.testing.assert_allclose(found.T_map_cam[:count], first.T_map_cam, atol=1e-6)
+    np.testing.assert_allclose(found.T_map_cam[count:], first.T_map_cam, atol=0.02)
+    queries = [one.query_id for one in found.loops if one.accepted and one.query_id >= count]
+    assert min(queries) <= killed_at < max(queries)
+    assert contents(tmp_path / "old") == before
 
 
 def test_a_mono_run_that_only_localises_knows_the_keyframe_that_a_session_began_with(tmp_path: Path) -> None:
