@@ -14,10 +14,12 @@ from enum import StrEnum
 from typing import Any, Protocol
 
 from seamark import SeamarkError
+from seamark.service.repeated_errors import RepeatedErrors
 from seamark.service.topics import RUNNER, Kind, Topic
 from seamark.service.wire import WireError, decode, encode
 
 logger = logging.getLogger(__name__)
+bugs = RepeatedErrors(logger)
 
 #: Takes a message; returns the reply of a request. For an acked topic it returns None, or a Future (for example that of
 #: its own ``send``): the message is acknowledged when that is done.
@@ -73,7 +75,7 @@ def error_reply(error: BaseException) -> RemoteError:
         return RemoteError(ErrorCode.INVALID, str(error))
     if isinstance(error, SeamarkError):
         return RemoteError(ErrorCode.FAILED, str(error))
-    logger.error("a handler failed", exc_info=error)
+    bugs.log("a handler failed", error)
     return RemoteError(ErrorCode.INTERNAL, f"{type(error).__name__}; see the node's log")
 
 

@@ -29,9 +29,12 @@ logger = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 60.0
 RESTORE_TIMEOUT_S = 1800.0  # a large map without a place index beside it is described anew; who dies is noticed
+PROGRESS_TIMEOUT_S = RESTORE_TIMEOUT_S  # of a node that lives and does not say how far it is: it may open a large map
 STOP_TIMEOUT_S = 4.0  # for all nodes together: 5 s with what is around it, on a busy machine
 # Until when each node may take its time, so that those behind it have theirs; what has not ended then is killed.
 STOP_SHARES = {FRONTEND: 0.45, VOCAB: 0.75, BACKEND: 1.0}
+CLOSE_TIMEOUT_S = 0.5  # for the bus and the session of this process, once no node is left
+KILL_TIMEOUT_S = 1.0  # until a killed process is gone
 MAX_RESTARTS = 3  # of one node within RESTARTS_WITHIN_S: a crash now and then in months is none too many
 RESTARTS_WITHIN_S = 600.0
 PROGRESS_EVERY_S = 0.1
@@ -153,16 +156,18 @@ class Launcher:
         began, patience_s = time.monotonic(), STOP_TIMEOUT_S if gently else STOP_TIMEOUT_S / 2
         for name in NODES:
             self._stop_child(name, began + patience_s * STOP_SHARES[name])
-        if self._bus is not None:
-            self._bus.close()
-            self._bus = None
-        if self._watch is not None:
-            self._watch.close()
-            self._watch = None
-        if self._session is not None:
-            self._session.close()
-            self._session = None
+        closing = threading.Thread(target=self._close, name="close", daemon=True)
+        closing.start()
+        closing.join(CLOSE_TIMEOUT_S)
+        if closing.is_alive():
+            logger.warning("the session does not close, and ends with this process")
         return self.usage()
+
+    def _close(self) -> None:
+        for one in (self._bus, self._watch, self._session):
+            if one is not None:
+                one.close()
+        self._bus = self._watch = self._session = None
 
     def usage(self) -> tuple[ProcessUsage, ...]:
         """Return what the processes that have ended have used, restarts of one node together."""
@@ -249,7 +254,11 @@ class Launcher:
         with self._lock:
             self._settings = replace(self._settings, restore=self._settings.map_path is not None)
         if child.name == FRONTEND:
-            self._counting_on(LOST_KEYFRAMES)
+            try:
+                self._counting_on(LOST_KEYFRAMES)
+            except NodeFailedError as error:
+                self._failure = NodeFailedError(f"{sentence}; {error}")
+                return
         with self._lock:
             if self._stopping:
                 return
@@ -273,15 +282,19 @@ class Launcher:
             self._settings = replace(self._settings, first_keyframe_id=keyframe_id + margin, first_session=session)
 
     def _progress_of(self, node: str) -> Mapping[str, int]:
-        """Return a node's counters, however long that takes: it may have died too, and a number that is given again
-        would be taken for a keyframe that is known.
+        """Return a node's counters, as soon as it says them: it may have died too, and a number that is given again
+        would be taken for a keyframe that is known. Raises NodeFailedError after PROGRESS_TIMEOUT_S.
         """
+        deadline = time.monotonic() + PROGRESS_TIMEOUT_S
         while not (self._stopping or self._failure or self._interrupted()):
             try:
-                status: Status = self.bus.request(PROGRESS[node], Empty())
+                patience_s = min(PROGRESS[node].timeout_s, max(PROGRESS_EVERY_S, deadline - time.monotonic()))
+                status: Status = self.bus.request(PROGRESS[node], Empty(), patience_s)
                 return status.counters
             except BusError as error:
                 logger.debug("the %s node does not say how far it is: %s", node, error)
+                if time.monotonic() > deadline:
+                    raise NodeFailedError(f"the {node} node lives and does not say how far it is") from error
                 time.sleep(PROGRESS_EVERY_S)
         return {}
 
@@ -297,7 +310,8 @@ class Launcher:
         if not child.ended.wait(max(0.0, deadline - time.monotonic())):
             logger.warning("%s has not stopped after %.0f s and is killed", name, time.monotonic() - started)
             self._signal(child, signal.SIGKILL)
-            child.ended.wait()
+            if not child.ended.wait(KILL_TIMEOUT_S):  # the kernel lets go of it when the disk does
+                logger.error("%s (process %d) cannot be killed and is left", name, child.process.pid)
 
     def _signal(self, child: _Child, number: signal.Signals) -> None:
         with self._lock:

@@ -18,6 +18,7 @@ from seamark.service.bus import (
     RemoteError,
     UnavailableError,
     WrongKindError,
+    bugs,
     check_kind,
     error_reply,
 )
@@ -285,5 +286,5 @@ class ZenohBus:
                 self._count_refused(topic.name, error_reply(error))
             except BusClosedError:
                 return
-            except Exception:
-                logger.exception("a subscriber of %s failed", topic.name)
+            except Exception as error:
+                bugs.log(f"a subscriber of {topic.name} failed", error)

@@ -20,11 +20,13 @@ from seamark.service.bus import (
     UnavailableError,
     error_reply,
 )
+from seamark.service.repeated_errors import RepeatedErrors
 from seamark.service.topics import Topic
 from seamark.service.wire import WireError, decode, encode, encoding_of
 from seamark.service.zenoh_delivery import TIMEOUT_PAYLOAD, answer, payload_of, refusal, refuse
 
 logger = logging.getLogger(__name__)
+bugs = RepeatedErrors(logger)
 
 # A router keeps time as well and may end a query a little before the asker's own timer does, without a word: what ends
 # after this part of the time without a reply has timed out.
@@ -58,8 +60,8 @@ class Worker:
         while (work := self._work.get()) is not None and not self._closed:
             try:
                 work()
-            except Exception:
-                logger.exception("work of %s failed", self._thread.name)
+            except Exception as error:
+                bugs.log(f"work of {self._thread.name} failed", error)
             del work  # a query that is kept is never ended
 
 

@@ -19,7 +19,7 @@ class FakeNode:
         self._bus, self._settings = bus, settings
         bus.handle(topics.STATUS[bus.node], lambda _: self._status())
         if bus.node in topics.PROGRESS:
-            bus.handle(topics.PROGRESS[bus.node], lambda _: self._status())
+            bus.handle(topics.PROGRESS[bus.node], lambda _: self._progress())
         if bus.node == topics.FRONTEND:
             bus.handle(topics.FRAME, self._on_frame)
 
@@ -41,6 +41,11 @@ class FakeNode:
             "threads": int(os.environ["OMP_NUM_THREADS"]),
         }
         return Status(self._bus.node, os.getpid(), 0, 0, 0.0, counters)
+
+    def _progress(self) -> Status:
+        if self._bus.node == topics.BACKEND and sys.argv[2] == "mute":
+            time.sleep(2)
+        return self._status()
 
     def _on_frame(self, frame: Frame) -> Odometry:
         if frame.index == 13:

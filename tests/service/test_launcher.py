@@ -150,6 +150,19 @@ def test_a_node_that_cannot_be_started_again_ends_the_service(tmp_path: Path, mo
             wait_until(lambda: launcher.check())  # type: ignore[func-returns-value]
 
 
+def test_a_node_that_does_not_say_how_far_it_is_ends_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Test: a front end is to be started again while the back end lives and does not answer. Expected: an end."""
+    monkeypatch.setattr(launcher_module, "PROGRESS_TIMEOUT_S", 0.5)
+    with launch(tmp_path, "mute") as launcher:
+        os.kill(launcher.process_id(FRONTEND), signal.SIGKILL)
+        with pytest.raises(
+            NodeFailedError, match=r"the frontend node has ended.*the backend node lives and does not say"
+        ):
+            wait_until(lambda: launcher.check())  # type: ignore[func-returns-value]
+
+
 def test_a_node_that_does_not_stop_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launcher_module, "STOP_TIMEOUT_S", 0.3)
     with launch(tmp_path, "stubborn") as launcher:
