@@ -13,7 +13,8 @@ from seamark.backend.config import BackendConfig, VerificationConfig
 from seamark.backend.errors import MapError
 from seamark.backend.evidence import Evidence
 from seamark.backend.far_landmarks import Landmarks, with_far_landmarks
-from seamark.backend.map_store import MapStore, Verdict
+from seamark.backend.map_reader import Verdict
+from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop
 from seamark.backend.verify import pair_seed, verify
 from seamark.frontend import se3

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.map_store import FEATURES, IMAGES, MapStore
+from seamark.backend.map_reader import FEATURES, IMAGES
+from seamark.backend.map_store import MapStore
 from seamark.backend.surfaces import Surface, surface_of
 from seamark.frontend import se3
 from seamark.frontend.types import Keyframe

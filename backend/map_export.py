@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from seamark.backend.errors import MapError
 from seamark.backend.map_codec import motion_between
 from seamark.backend.map_dense import dense_points
-from seamark.backend.map_store import FEATURES, IMAGES, MapStore
+from seamark.backend.map_reader import FEATURES, IMAGES
+from seamark.backend.map_store import MapStore
 from seamark.backend.map_tracks import points_of, posed
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera

@@ -5,7 +5,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from seamark.backend.errors import MapError
-from seamark.backend.map_store import FEATURES, MapStore
+from seamark.backend.map_reader import FEATURES
+from seamark.backend.map_store import MapStore
 from seamark.backend.slam import Slam
 from seamark.frontend.types import Keyframe
 

@@ -14,7 +14,8 @@ from seamark.backend.config import BackendConfig
 from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.errors import MapError
 from seamark.backend.graph_types import Constraint
-from seamark.backend.map_store import FEATURES, MapStore
+from seamark.backend.map_reader import FEATURES
+from seamark.backend.map_store import MapStore
 from seamark.backend.types import Loop, MapSnapshot
 from seamark.frontend import se3
 

@@ -10,8 +10,9 @@ from typing import Any, Final
 from seamark.backend.errors import MapCorruptError, MapError
 from seamark.backend.map_carve import carve
 from seamark.backend.map_codec import checksum, decode_array, encode_array, motion_between, row_name, sealed
-from seamark.backend.map_file import MapFile, sync_to_disk
+from seamark.backend.map_file import MapFile
 from seamark.backend.map_migrations import V1_COLUMNS, checksum_v1, convert_v1
+from seamark.backend.map_new import new_map
 from seamark.backend.map_schema import COLUMNS, KEYS, select, upsert
 
 BATCH: Final = 200
@@ -36,16 +37,16 @@ def repair_map(path: Path, out: Path) -> RepairReport:
 
     Raises MapError when ``out`` exists or nothing could be saved.
     """
-    if out.exists():
-        raise MapError(f"{out} exists: a repair writes a new file")
     if not path.exists():
         raise MapError(f"there is no map at {path}")
     if path.is_dir():
         raise MapError(f"{path} is a folder, and a map is a file")
-    report = RepairReport()
-    partial = out.with_name(out.name + ".partial")
-    partial.unlink(missing_ok=True)
     try:
+        path.open("rb").close()
+    except OSError as error:
+        raise MapError(f"{path} cannot be read: {error.strerror}") from error
+    report = RepairReport()
+    with new_map(out, "repair") as partial:
         with closing(MapFile(partial)) as file:
             with file.reading() as database:
                 database.execute("PRAGMA foreign_keys = OFF")  # until _mend has seen to them
@@ -59,12 +60,6 @@ def repair_map(path: Path, out: Path) -> RepairReport:
                     report.saved[table] = database.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
         if broken or not report.saved["keyframes"]:
             raise MapError(f"nothing could be saved of {path}")
-        sync_to_disk(partial)
-        partial.rename(out)
-        sync_to_disk(out.absolute().parent)
-    finally:
-        for leftover in (partial, *(partial.with_name(partial.name + end) for end in ("-wal", "-shm"))):
-            leftover.unlink(missing_ok=True)
     return report
 
 

@@ -1,28 +1,19 @@
 """The map on disk: one SQLite file that survives ``kill -9`` at any moment."""
 
 import sqlite3
-import threading
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.adjustment import Adjustment
-from seamark.backend.errors import MapCorruptError, MapError
-from seamark.backend.evidence import Evidence, decode_evidence, encode_evidence
-from seamark.backend.graph_types import Span
-from seamark.backend.map_adjustments import decode_adjustments, replace_adjustments, write_adjustments
+from seamark.backend.errors import MapError
+from seamark.backend.evidence import encode_evidence
+from seamark.backend.map_adjustments import replace_adjustments, write_adjustments
 from seamark.backend.map_codec import (
-    check_row,
     decode_array,
-    decode_camera,
-    decode_keyframe,
-    decode_loop,
-    decode_span,
     encode_array,
     encode_camera,
     encode_keyframe,
@@ -30,39 +21,19 @@ from seamark.backend.map_codec import (
     lighting_of,
     sealed,
 )
-from seamark.backend.map_contraction import Contracted, Mean, write_means, write_nodes
+from seamark.backend.map_contraction import Contracted, write_means, write_nodes
 from seamark.backend.map_file import MapFile
+from seamark.backend.map_reader import IMAGES, MapReader, Session
 from seamark.backend.map_schema import select, upsert
-from seamark.backend.types import Loop, MapSnapshot, Reason
+from seamark.backend.types import Loop, MapSnapshot
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.types import Keyframe
 
-FEATURES, IMAGES = "features", "images"
 POSE_TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """One entry of a loop's history: what was thought of it when keyframe ``newest_keyframe_id`` was the newest."""
-
-    accepted: bool
-    reason: Reason
-    newest_keyframe_id: int
-    revision: int
-
-
-@dataclass(frozen=True)
-class Session:
-    """One session: where it begins, and the session in whose frame of reference its poses are."""
-
-    id: int
-    first_keyframe_id: int
-    stamp_ns: int
-    component: int
-
-
-class MapStore:
+class MapStore(MapReader):
     """Keyframes, loops and poses in the file ``path``, created when missing (unless ``read_only`` or ``existing``).
 
     What a method has written is on disk when it returns (write-ahead log, full synchronisation); while the map is
@@ -74,10 +45,7 @@ class MapStore:
     def __init__(
         self, path: Path, read_only: bool = False, beside_writer: bool = False, existing: bool = False
     ) -> None:
-        self.path = path
-        self.file = MapFile(path, read_only, beside_writer, existing)
-        self._opening = threading.RLock()  # held while the file is read, and while it is opened anew
-        self._cameras: dict[int, Camera] = {}
+        super().__init__(MapFile(path, read_only, beside_writer, existing))
         self._written: dict[int, tuple[NDArray[np.float64], float]] = {}  # poses as they are in the file
 
     def __enter__(self) -> "MapStore":
@@ -102,10 +70,6 @@ class MapStore:
     def set_meta(self, values: Mapping[str, str]) -> None:
         """Write facts about the whole map: mode, vocabulary hash, config hash, version that created it, revision."""
         self.record(meta=values)
-
-    def meta(self) -> dict[str, str]:
-        """Return the facts about the whole map."""
-        return {row["key"]: row["value"] for row in self._rows("meta")}
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Write a keyframe; it is safe on disk when this returns. One that is there already is replaced.
@@ -156,19 +120,6 @@ class MapStore:
         """Write loops' rows in one transaction, replacing earlier verdicts on the same pairs."""
         self.record(loops)
 
-    def evidence(self, query_id: int, match_id: int) -> Evidence | None:
-        """Return what a loop rests on, None when nothing was kept."""
-        rows = self._rows("evidence", "query_id = ? AND match_id = ?", (int(query_id), int(match_id)))
-        return decode_evidence(rows[0]["content"]) if rows else None
-
-    def history(self, query_id: int, match_id: int) -> tuple[Verdict, ...]:
-        """Return all verdicts on a loop, the oldest first."""
-        rows = self._rows("history", "query_id = ? AND match_id = ?", (int(query_id), int(match_id)))
-        return tuple(
-            Verdict(bool(row["accepted"]), Reason(row["reason"]), row["newest_keyframe_id"], row["revision"])
-            for row in rows
-        )
-
     def update_poses(self, snapshot: MapSnapshot) -> None:
         """Write all poses and the revision of a snapshot in one transaction."""
         self.record(snapshot=snapshot)
@@ -189,73 +140,6 @@ class MapStore:
         for number in change.graph.gone:
             self._written.pop(number, None)
 
-    def keyframe_ids(self, recognisable: bool = False) -> list[int]:
-        """Return the ids of all keyframes, or of those that have features, ascending."""
-        table, column = ("views", "keyframe_id") if recognisable else ("keyframes", "id")
-        with self._reading() as database:
-            return [row[0] for row in database.execute(f"SELECT {column} FROM {table} ORDER BY 1")]
-
-    def load_keyframes(self) -> Iterator[Keyframe]:
-        """Yield all keyframes by ascending id, read one at a time."""
-        for keyframe_id in self.keyframe_ids():
-            yield self.keyframe(keyframe_id)
-
-    def load_nodes(self) -> list[Keyframe]:
-        """Return all keyframes by ascending id without features, landmarks and images."""
-        keyframes, edges = self._rows("keyframes"), {row["keyframe_id"]: row for row in self._rows("edges")}
-        return [
-            decode_keyframe(row, _edge(edges.get(row["id"]), row["id"]), self._camera(row["camera_id"]))
-            for row in keyframes
-        ]
-
-    def keyframe(self, keyframe_id: int, parts: tuple[str, ...] = (FEATURES, IMAGES)) -> Keyframe:
-        """Return one keyframe with these parts of it; raises MapError when there is none of this id."""
-        number = (int(keyframe_id),)
-        rows = self._rows("keyframes", "id = ?", number)
-        if not rows:
-            raise MapError(f"{self.path} has no keyframe {keyframe_id}")
-        tables = (
-            ("edges",) + ("features", "landmarks", "depths") * (FEATURES in parts) + ("images",) * (IMAGES in parts)
-        )
-        found = {table: next(iter(self._rows(table, "keyframe_id = ?", number)), None) for table in tables}
-        edge, camera = _edge(found.pop("edges"), keyframe_id), self._camera(rows[0]["camera_id"])
-        return decode_keyframe(rows[0], edge, camera, **found)
-
-    def load_loops(self) -> tuple[Loop, ...]:
-        """Return all loops' rows in the order of their pairs."""
-        return tuple(decode_loop(row) for row in self._rows("loops"))
-
-    def load_sessions(self) -> tuple[Session, ...]:
-        """Return all sessions by ascending id."""
-        return tuple(Session(*tuple(row)[:-1]) for row in self._rows("sessions"))
-
-    def load_poses(self) -> dict[int, tuple[NDArray[Any] | None, int, float]]:
-        """Return for each keyframe that has been in a snapshot its T_map_cam (or None), component and scale."""
-        components = {session.id: session.component for session in self.load_sessions()}
-        sessions = self.session_of_keyframes()
-        return {
-            row["keyframe_id"]: (
-                decode_array(row["T_map_cam"]),
-                components.get(sessions[row["keyframe_id"]], sessions[row["keyframe_id"]]),
-                row["scale"],
-            )
-            for row in self._rows("poses")
-        }
-
-    def load_spans(self) -> dict[int, Span]:
-        """Return what the motions are made of on whose way keyframes have gone."""
-        return {row["keyframe_id"]: decode_span(row) for row in self._rows("spans")}
-
-    def load_means(self) -> dict[tuple[int, int], Mean]:
-        """Return what is known of composed loops beside their rows."""
-        return {
-            (row["query_id"], row["match_id"]): Mean(row["count"], row["scale_sigma"]) for row in self._rows("composed")
-        }
-
-    def load_adjustments(self) -> tuple[Adjustment, ...]:
-        """Return what full adjustments have found, whether they stand or not."""
-        return decode_adjustments(self._rows("adjusted"), self._rows("adjusted_loops"))
-
     def load_lightings(self, after: int = -1) -> dict[int, NDArray[np.float64]]:
         """Return mean and spread of the colours (6,) of all keyframes ``after`` this one that can be recognised.
 
@@ -271,18 +155,6 @@ class MapStore:
                 rows = [sealed("views", (number, encode_array(found[number]))) for number in missing]
                 database.executemany(upsert("views"), rows)
         return {number: lighting for number, lighting in found.items() if lighting is not None}
-
-    def session_of_keyframes(self) -> dict[int, int]:
-        """Return the session of each keyframe."""
-        with self._reading() as database:
-            return dict(map(tuple, database.execute("SELECT id, session FROM keyframes")))
-
-    def bytes_used(self) -> int:
-        """Return how many bytes of the file hold something: free pages are used again before it grows."""
-        with self._reading() as database:
-            names = ("page_count", "freelist_count", "page_size")
-            count, free, size = (database.execute(f"PRAGMA {name}").fetchone()[0] for name in names)
-        return int((count - free) * size)
 
     def export_single_file(self) -> None:
         """Move the write-ahead log into the file, so that ``path`` alone is the whole map."""
@@ -302,18 +174,6 @@ class MapStore:
         """Make the map one file and close it; harmless when repeated."""
         self.file.close()
 
-    @contextmanager
-    def _reading(self) -> Iterator[sqlite3.Connection]:
-        with self._opening, self.file.reading() as database:
-            yield database
-
-    def _rows(self, table: str, condition: str = "", values: tuple[Any, ...] = ()) -> list[sqlite3.Row]:
-        with self._reading() as database:
-            rows = database.execute(select(table, condition), values).fetchall()
-        for row in rows:
-            check_row(table, row)
-        return rows
-
     def _odometry_of(
         self, database: sqlite3.Connection, previous_id: int, keyframe: Keyframe
     ) -> NDArray[np.float64] | None:
@@ -321,11 +181,6 @@ class MapStore:
         if row is None:
             raise MapError(f"keyframe {keyframe.id} follows {previous_id}, which is not in the map")
         return decode_array(row["T_odom_cam"])
-
-    def _camera(self, camera_id: int | None) -> Camera | None:
-        if camera_id is not None and camera_id not in self._cameras:
-            self._cameras |= {row["id"]: decode_camera(row["model"]) for row in self._rows("cameras")}
-        return None if camera_id is None else self._cameras[camera_id]
 
     def _camera_id(self, database: sqlite3.Connection, camera: Camera) -> int:
         model = encode_camera(camera)
@@ -375,9 +230,3 @@ class MapStore:
                 values = (session.id, session.first_keyframe_id, session.stamp_ns, wanted[session.id])
                 database.execute(upsert("sessions"), sealed("sessions", values))
         return written
-
-
-def _edge(row: sqlite3.Row | None, keyframe_id: int) -> sqlite3.Row:
-    if row is None:
-        raise MapCorruptError(f"the edge of keyframe {keyframe_id} is missing")
-    return row

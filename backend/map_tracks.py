@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from seamark.backend.map_store import FEATURES, MapStore
+from seamark.backend.map_reader import FEATURES
+from seamark.backend.map_store import MapStore
 from seamark.backend.matching import match_features
 from seamark.frontend.types import Keyframe
 

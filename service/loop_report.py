@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from seamark.backend.explain import Explanation
-from seamark.backend.map_store import Verdict
+from seamark.backend.map_reader import Verdict
 from seamark.backend.types import Loop
 from seamark.frontend.types import Keyframe
 from seamark.service.directions import direction_as_json

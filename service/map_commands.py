@@ -14,6 +14,7 @@ EXIT_DAMAGED = 3
 
 map_app = typer.Typer(no_args_is_help=True, help="Map files: look at them, check, repair, export and prune them.")
 
+NewMapOption = Annotated[Path, typer.Option("--out", help="The new map file to write.")]
 MapArgument = Annotated[Path, typer.Argument(help="The map file.")]
 OverrideOption = Annotated[list[str] | None, typer.Option("-o", metavar="KEY=VALUE", help="Set section.key=value.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -52,7 +53,7 @@ def check_command(map_file: MapArgument, as_json: JsonOption = False) -> None:
 @map_app.command("repair")
 def repair_command(
     map_file: MapArgument,
-    out: Annotated[Path, typer.Option("--out", help="The new map file to write.")],
+    out: NewMapOption,
     as_json: JsonOption = False,
 ) -> None:
     """Save all that is whole in a damaged map (or one of an earlier version) to a new file, and say what is lost."""
@@ -69,7 +70,7 @@ def repair_command(
 @map_app.command("backup")
 def backup_command(
     map_file: MapArgument,
-    out: Annotated[Path, typer.Option("--out", help="The new map file to write.")],
+    out: NewMapOption,
     as_json: JsonOption = False,
 ) -> None:
     """Copy a map as it is at this moment. A service may be writing it meanwhile, and is not held up."""
@@ -112,9 +113,7 @@ def export_command(
 def prune_command(
     map_file: MapArgument,
     keyframes: Annotated[int, typer.Option("--keyframes", min=1, help="Views to keep, as far as places allow.")],
-    override: Annotated[
-        list[str] | None, typer.Option("-o", metavar="KEY=VALUE", help="Set section.key=value.")
-    ] = None,
+    override: OverrideOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Forget redundant views of a map that no service is writing; each place keeps one of each lighting."""

@@ -12,9 +12,10 @@ from seamark.backend.adjustment import AdjustedPose, Adjustment
 from seamark.backend.errors import MapCorruptError, MapVersionError
 from seamark.backend.map_check import check_map
 from seamark.backend.map_migrations import MIGRATIONS
+from seamark.backend.map_reader import Verdict
 from seamark.backend.map_repair import repair_map
 from seamark.backend.map_schema import SCHEMA_VERSION
-from seamark.backend.map_store import MapStore, Verdict
+from seamark.backend.map_store import MapStore
 from seamark.backend.types import Reason
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.keyframe_depth import encode_depth
