@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from seamark.backend.config import VerificationConfig
 from seamark.backend.pose_errors import PoseSystem
-from seamark.backend.shared_errors import cells_of, independent_share
+from seamark.backend.shared_errors import cells_of, excess_angle, independent_share, measured_share
 from seamark.backend.verify_pose import usac_parameters
 from seamark.frontend import se3
 from seamark.frontend.camera import Camera
@@ -105,7 +105,7 @@ def direction_of(E: Matrix, views: Views, inliers: Flags, config: VerificationCo
         return None
     R, t = start
     for _ in range(STEPS):
-        J, r, basis, _ = _system(R, t, rays_query, rays_match, views, config)
+        J, r, basis, _ = _system(R, t, rays_query, rays_match, views, config, config.shared_share)
         information = J.T @ J + 1e-9 * np.eye(5)
         step = np.linalg.solve(information, -J.T @ r)
         R, t = R @ se3.exp_rotation(step[:3]), t + basis @ step[3:]
@@ -119,21 +119,44 @@ def _sure(
     R: Matrix, t: Array, rays_query: Matrix, rays_match: Matrix, views: Views, config: VerificationConfig
 ) -> Direction | None:
     """Return what of a refined pose the matches hold."""
-    J, r, _, weights = _system(R, t, rays_query, rays_match, views, config)
-    if np.count_nonzero(weights) < config.min_epipolar_inliers:
-        return None
+    assert views.cameras is not None
+    match = views.cameras[1]
+    share = config.shared_share
+    for _ in range(2):  # the second time with what neighbours are seen to share
+        J, r, _, weights = _system(R, t, rays_query, rays_match, views, config, share)
+        used = weights > 0
+        if np.count_nonzero(used) < config.min_epipolar_inliers:
+            return None
+        flat = np.column_stack([r, np.zeros(len(r))])[used]
+        share = measured_share([(flat, weights[used], cells_of(views.match[used], match))], config.shared_share)
     # Only upwards: what lies beyond the limit was left out, so that the rest seems better than it is.
     scale = max((PRIOR_FREEDOM + float((r**2).sum())) / (PRIOR_FREEDOM + max(float(weights.sum()) - 5, 0.0)), 1.0)
-    H = J.T @ J
-    if np.linalg.cond(H) > 1e9:
+    if np.linalg.cond(J.T @ J) > 1e9:
         return None
     # As for poses with depth: no single match, which may be a wrong one near a line, is to hold what is claimed.
-    left = PoseSystem(J, r, np.arange(len(r)), scale, config.shared_share).without_one(np.ones(5))
+    left = PoseSystem(J, r, np.arange(len(r)), scale, share).without_one(np.ones(5))
     turn, way = (float(np.sqrt(np.linalg.eigvalsh(left[:, one, one])[:, -1].max())) for one in (slice(3), slice(3, 5)))
-    if 1 / way**2 < PARALLAX * float(weights.sum()) or _on_one_plane(views.some(weights > 0), config):
+    if 1 / way**2 < PARALLAX * float(weights.sum()) or _on_one_plane(views.some(used), config):
         return None
+    # What the whole view errs by in common turns it, and is taken for a part of the parallax.
+    turned = float(se3.rotation_angle(R))
+    angle = np.hypot(
+        excess_angle(scale, share, match.fx, config),
+        np.deg2rad(config.rotation_floor_deg) + config.rotation_systematic * turned,
+    )
+    turn, way = (
+        float(np.hypot(turn, angle)),
+        float(np.hypot(way, angle / _parallax(R, rays_query[used], rays_match[used]))),
+    )
     sure = np.rad2deg(turn) < config.max_rotation_sigma_deg and way < MOST_BEARING_SIGMA
     return Direction(R, t, turn, way) if sure else None
+
+
+def _parallax(R: Matrix, rays_query: Matrix, rays_match: Matrix) -> float:
+    """Return the middle angle (rad) between the rays of both views."""
+    turned = rays_query @ R.T
+    sine = np.linalg.norm(np.cross(turned, rays_match), axis=1)
+    return float(np.median(np.arctan2(sine, (turned * rays_match).sum(axis=1))))
 
 
 def _in_front(E: Matrix, rays_query: Matrix, rays_match: Matrix, noise: float) -> tuple[Matrix, Array] | None:
@@ -161,7 +184,13 @@ def _ahead(turned: Matrix, rays_match: Matrix, t: Array, noise: float) -> tuple[
 
 
 def _system(
-    R: Matrix, t: Array, rays_query: Matrix, rays_match: Matrix, views: Views, config: VerificationConfig
+    R: Matrix,
+    t: Array,
+    rays_query: Matrix,
+    rays_match: Matrix,
+    views: Views,
+    config: VerificationConfig,
+    share: float,
 ) -> tuple[Matrix, Array, Matrix, Array]:
     """Return the Jacobian (M, 5), rotation first, of the distances (M,) from the epipolar lines in standard deviations
     (Sampson 1982), the basis (3, 2) of the bearing's tangent, and the weights (M,), 0 for
@@ -180,7 +209,7 @@ def _system(
     weights = 1 / (1 + r**2 / CAUCHY_WIDTH**2)
     near = np.abs(r) * config.noise_px < config.epipolar_px
     near &= np.logical_or(*_ahead(turned, rays_match, t, SQRT2 * config.noise_px / match.fx))
-    weights[near] *= independent_share(cells_of(views.match[near], match), config.shared_share)
+    weights[near] *= independent_share(cells_of(views.match[near], match), share)
     weights[~near] = 0
     root = np.sqrt(weights)
     return J * root[:, None], r * root, basis, weights

@@ -1,6 +1,7 @@
 """The pose without its length, against cameras whose poses are known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,11 +55,19 @@ def test_rotation_and_bearing_are_right_and_as_sure_as_they_say(world, move, req
 
 
 def test_what_neighbours_share_makes_it_less_sure(world, move):
+    """Test: key points off by half a pixel, each by itself or all of a cell alike. Expected: the latter tell less."""
     w, truth = world(1), truth_of(move, 1)
-    pair = w.view(truth, depth=False), w.view(np.eye(4), depth=False)
-    white, cautious = (verify(*pair, config, 1).direction for config in (WHITE, CONFIG))
-    assert white.rotation_sigma < 0.8 * cautious.rotation_sigma
-    assert white.bearing_sigma < 0.8 * cautious.bearing_sigma
+    match, query = w.view(np.eye(4), noise_px=0.1, depth=False), w.view(truth, noise_px=0.1, depth=False)
+    points, rng = match.features.points, np.random.default_rng(1)
+    cells = (points // 80).astype(int) @ (1, 8)
+    alone, alike = rng.normal(0, 0.7, (len(points), 2)), rng.normal(0, 0.7, (48, 2))[cells]
+    sigmas = []
+    for off in (alone, alike):
+        moved = replace(match.features, points=(points + off).astype(np.float32))
+        said = verify(query, replace(match, features=moved), CONFIG, 1).direction
+        sigmas.append((said.rotation_sigma, said.bearing_sigma))
+    assert 1.3 * sigmas[0][0] < sigmas[1][0] < 10 * sigmas[0][0]
+    assert 1.3 * sigmas[0][1] < sigmas[1][1] < 10 * sigmas[0][1]
 
 
 def test_nothing_is_said_where_the_views_leave_it_open(world, move):
