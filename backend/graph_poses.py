@@ -1,13 +1,13 @@
 """Where the keyframes of a pose graph are, and in whose frame; free of GTSAM."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from seamark.backend.consistency import similarity
 from seamark.backend.errors import BackendInputError
-from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_node
+from seamark.backend.graph_types import Constraint, Estimate, Key, Node, check_nodes
 from seamark.frontend import se3
 
 Matrix = NDArray[np.float64]
@@ -35,7 +35,15 @@ class GraphPoses:
 
     def add(self, node: Node) -> None:
         """Append a keyframe, which hangs on its predecessor; raises BackendInputError when it is malformed or known."""
-        check_node(node)
+        self.extend([node])
+
+    def extend(self, nodes: Sequence[Node]) -> None:
+        """Append keyframes one after the other; raises BackendInputError at the first that is malformed or known."""
+        check_nodes(nodes)
+        for node in nodes:
+            self._append(node)
+
+    def _append(self, node: Node) -> None:
         if node.id in self.rows:
             raise BackendInputError(f"keyframe {node.id} was given twice")
         before = self._last_rows.get(node.session, -1)

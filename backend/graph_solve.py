@@ -132,19 +132,20 @@ class _Run:
 
     def commit(self, verdicts: dict[Key, Reason]) -> bool:
         """Bring the pose graph in line with these verdicts; return whether it has changed."""
-        changed = False
+        accepted, withdrawn = [], []
         for key, reason in verdicts.items():
             constraint = self.ledger.finding(key).constraint
             if (reason == Reason.ACCEPTED) == (key in self.committed) or constraint is None:
                 continue
-            changed = True
             if reason == Reason.ACCEPTED:
-                self.poses.add_loop(constraint)
-                self.committed.add(key)
+                accepted.append(constraint)
             else:
-                self.poses.remove_loop(*key)
-                self.committed.discard(key)
-        return changed
+                withdrawn.append(key)
+        self.poses.add_loops(accepted)
+        for key in withdrawn:
+            self.poses.remove_loop(*key)
+        self.committed = (self.committed | {constraint.key for constraint in accepted}) - set(withdrawn)
+        return bool(accepted or withdrawn)
 
     def verdicts(self) -> tuple[LoopVerdict, ...]:
         """Return a row per loop candidate, duplicates last."""
@@ -194,8 +195,7 @@ class _Batch(_Run):
             again = Noise(self.estimate_noise(believed).odometry, noise.loops)
             if again.odometry < noise.odometry:
                 verdicts = self._judge_all(again)
-        for node in self.parts.nodes:
-            self.poses.add_keyframe(node)
+        self.poses.add_keyframes(self.parts.nodes)
         self.commit(verdicts)
 
     def _judge_all(self, noise: Noise) -> dict[Key, Reason]:

@@ -146,15 +146,14 @@ def check_node(node: Node) -> None:
 
 def check_nodes(nodes: Sequence[Node]) -> None:
     """Do what ``check_node`` does for many nodes at once; of those that are malformed the first is named."""
-    if nodes and not _all_sound(nodes):
+    if nodes and not _all_sound([x.T_odom_cam for x in nodes], [x.covariance for x in nodes]):
         for node in nodes:
             check_node(node)
 
 
-def _all_sound(nodes: Sequence[Node]) -> bool:
+def _all_sound(poses: Sequence[Matrix], covariances_of: Sequence[Matrix]) -> bool:
     try:
-        T = np.stack([node.T_odom_cam for node in nodes])
-        covariances = np.stack([node.covariance for node in nodes])
+        T, covariances = np.stack(poses), np.stack(covariances_of)
     except ValueError:  # shapes that differ
         return False
     if T.shape[1:] != (4, 4) or covariances.shape[1:] != (6, 6):
@@ -164,6 +163,18 @@ def _all_sound(nodes: Sequence[Node]) -> bool:
     R = T[:, :3, :3]
     rigid = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() <= 1e-3 and (np.linalg.det(R) >= 0).all()
     return bool(rigid and (np.diagonal(covariances, axis1=1, axis2=2) >= 0).all())
+
+
+def check_constraints(constraints: Sequence[Constraint]) -> None:
+    """Do what ``check_constraint`` does for many loops at once; of those that are malformed the first is named."""
+    if not constraints:
+        return
+    numbers = np.array([(x.scale, x.scale_sigma) for x in constraints])
+    sound = bool(np.isfinite(numbers).all() and (numbers > 0).all())
+    sound = sound and all(x.query_id != x.match_id for x in constraints)
+    if not sound or not _all_sound([x.T_match_query for x in constraints], [x.covariance for x in constraints]):
+        for constraint in constraints:
+            check_constraint(constraint)
 
 
 def check_constraint(constraint: Constraint) -> None:

@@ -14,7 +14,7 @@ from seamark.backend.consistency import chi_squared, cycle_error, similarity
 from seamark.backend.drift import drift_share
 from seamark.backend.errors import BackendInputError, SolverError
 from seamark.backend.graph_poses import GraphPoses
-from seamark.backend.graph_types import Constraint, Estimate, Graph, Key, Node, check_constraint
+from seamark.backend.graph_types import Constraint, Estimate, Graph, Key, Node, check_constraints
 from seamark.backend.graph_variables import PlanarVariables, PoseVariables, SimilarityVariables
 from seamark.frontend import se3
 
@@ -52,13 +52,18 @@ class PoseGraph:
         self._new_loops: list[Key] = []
         self._adjustments = Adjustments()
         self._chains = OdometryChains(self._drift)
+        self._chained = 0  # rows that the chains know
         self._share = 1.0  # of the drift allowed for that the loops bear out
         self._requested = False
 
     def add_keyframe(self, node: Node) -> None:
         """Append a keyframe; raises BackendInputError when it is malformed or was given before."""
-        self._poses.add(node)
-        if not node.metric and not isinstance(self._variables, SimilarityVariables):
+        self.add_keyframes([node])
+
+    def add_keyframes(self, nodes: Sequence[Node]) -> None:
+        """Append keyframes; raises BackendInputError at the first that is malformed or was given before."""
+        self._poses.extend(nodes)
+        if not all(node.metric for node in nodes) and not isinstance(self._variables, SimilarityVariables):
             self._variables = SimilarityVariables(self._config, self._drift)
             self._isam = None
 
@@ -67,11 +72,9 @@ class PoseGraph:
 
         With ``held`` these poses stay for good, and what joins them with each other is of no more use.
         """
-        for node in graph.nodes:
-            self.add_keyframe(node)
+        self.add_keyframes(graph.nodes)
         self._poses.take(graph.estimate)
-        for constraint in graph.loops:
-            self.add_loop(constraint)
+        self.add_loops(graph.loops)
         self._adjustments = Adjustments(graph.adjustments)
         self._adjustments.update(self._loops)
         self._revision = graph.estimate.revision
@@ -84,15 +87,21 @@ class PoseGraph:
 
     def add_loop(self, constraint: Constraint) -> None:
         """Commit a loop, replacing one of the same pair; it acts at the next ``optimise``."""
-        check_constraint(constraint)
-        key = constraint.key
-        for keyframe_id in key:
-            if keyframe_id not in self._poses.rows:
-                raise BackendInputError(f"{constraint.name} names keyframe {keyframe_id}, which is not known")
-        if key in self._loops:
-            self._isam = None
-        self._loops[key] = constraint
-        self._new_loops.append(key)
+        self.add_loops([constraint])
+
+    def add_loops(self, constraints: Sequence[Constraint]) -> None:
+        """Commit loops, as ``add_loop`` does; where one is malformed none of them."""
+        check_constraints(constraints)
+        for constraint in constraints:
+            for keyframe_id in constraint.key:
+                if keyframe_id not in self._poses.rows:
+                    raise BackendInputError(f"{constraint.name} names keyframe {keyframe_id}, which is not known")
+        for constraint in constraints:
+            key = constraint.key
+            if key in self._loops:
+                self._isam = None
+            self._loops[key] = constraint
+            self._new_loops.append(key)
 
     def remove_loop(self, query_id: int, match_id: int) -> None:
         """Withdraw a loop; what it alone had joined falls apart at the next ``optimise``."""
@@ -162,8 +171,9 @@ class PoseGraph:
         """Ask the loops how much odometry drifts, when there are new ones."""
         if not self._config.learn_drift or not self._new_loops:
             return
-        for node in self._poses.nodes[len(self._chains.nodes()) :]:
-            self._chains.add(node)
+        if self._chained < len(self._poses):
+            self._chains.extend(self._poses.nodes[self._chained :])
+            self._chained = len(self._poses)
         share = drift_share(list(self._loops.values()), self._chains, STRETCH)
         if share != self._share:
             self._share, self._isam = share, None
@@ -175,10 +185,11 @@ class PoseGraph:
             self._isam = self._variables.make_isam()
         rows = range(0 if fresh else self._solved_rows, len(self._poses))
         graph = self._factors(rows, self._loops if fresh else self._new_loops)
+        values = self._values(rows)
         try:
             error = before = self._isam.getFactorsUnsafe().error(self._isam.calculateEstimate())
-            before += graph.error(self._values(self._poses.rows[key] for key in graph.keyVector()))
-            self._isam.update(graph, self._values(rows))
+            before += graph.error(values if fresh else self._values(self._poses.rows[key] for key in graph.keyVector()))
+            self._isam.update(graph, values)
             for _ in range(self._config.incremental_updates):
                 if self._isam.update().getVariablesRelinearized() == 0:
                     break
