@@ -16,7 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from seamark.backend.bundle_links import followers, measured, motion_covariances, odometry_links, pose_of
+from seamark.backend.bundle_links import followers, measured, motion_covariances, odometry_links, pose_of, reweighed
 from seamark.backend.config import BackendConfig
 from seamark.backend.depth_errors import Depths, measure, parallax_sigma
 from seamark.backend.errors import SolverError
@@ -31,11 +31,12 @@ Matrix = NDArray[np.float64]
 
 EYES_M = 0.1  # between the eyes that a measured depth is expressed by
 HUBER = 1.345
+ODOMETRY_HUBER = 3.0  # of six numbers at once; single motions may be far worse than the rest
 OUTLIER = 4.0  # standard deviations beyond which an observation is dropped before the second round
 HELD_BY = 30  # tracks between neighbours below which what the map says joins them where odometry has no length
 LOST_PX = 50.0  # an observation whose landmark lies behind the camera counts as so far off
 RAYLEIGH = 1.1774  # median length of a vector of two normal errors of deviation 1
-WEAK_DEPTH = 0.1  # deviation of inverse depth, per median, in the first round
+WEAK_DEPTH = 10.0  # deviation of inverse depth, per median, in the first round
 FIRST_TOLERANCE = 1e-3  # relative change of the error that ends the first round
 PRIOR_SIGMA = 1e-4
 
@@ -96,6 +97,7 @@ def adjust(
     kept = problem.within(first.values, OUTLIER)
     problem.learn_noise(first.values, kept)
     problem.learn_depth(first.values, kept)
+    problem.learn_odometry(first.values)
     second = problem.solve(first.values, kept)
     values = second.values
     before, after = (np.minimum(problem.errors_px(which)[kept], LOST_PX) for which in (start, values))
@@ -195,6 +197,14 @@ class _Problem:
         solved = 1 / self._solved_depths(values)
         inverse = 1 / self._points[:, 2]
         self._depths = measure(inverse, solved, sigma, kept, self._pixels, list(models), camera, self._spread)
+
+    def learn_odometry(self, values: gtsam.Values) -> None:
+        """Take from the same solution how much odometry errs."""
+        if self._steps:
+            solved = {number: values.atPose3(X(number)).matrix() for number in self._keyframes}
+            z = self._points[:, 2]
+            depth = float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
+            self._steps = reweighed(self._steps, solved, self._depths.warp, depth)
 
     def scales(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the map units (N,) per unit of each keyframe's landmarks, by ascending id.
@@ -322,7 +332,8 @@ class _Problem:
             noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Covariance(loop.covariance))
             graph.add(gtsam.BetweenFactorPose3(X(loop.match_id), X(loop.query_id), pose_of(loop.T_match_query), noise))
         for before, number, T, covariance in self._steps:
-            noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+            robust = gtsam.noiseModel.mEstimator.Huber.Create(ODOMETRY_HUBER)
+            noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Covariance(covariance))
             graph.add(gtsam.BetweenFactorPose3(X(before), X(number), pose_of(T), noise))
         if not self._metric:
             self._join(graph, values, kept)

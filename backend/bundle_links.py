@@ -20,6 +20,8 @@ Matrix = NDArray[np.float64]
 Link = tuple[int, int, Matrix, Matrix]  # two keyframes, T_first_second and its covariance
 
 STRETCH: Final = 10  # loops of so many neighbouring keyframes close the same way
+MIDDLE_CHI2: Final = 5.348  # the median of chi squared with 6 degrees of freedom
+LEAST_SHARE: Final = 1 / 64  # of the variance that odometry allows for
 
 
 def followers(keyframes: Mapping[int, Keyframe]) -> list[tuple[int, int]]:
@@ -46,6 +48,27 @@ def odometry_links(keyframes: Mapping[int, Keyframe], loops: Sequence[Constraint
         covariance = white_covariances([nodes[number]], T[None], drift, share)[0]
         links.append((before, number, T, covariance * (number - before)))  # keyframes between have been forgotten
     return links
+
+
+def reweighed(links: Sequence[Link], T_solved: Mapping[int, Matrix], warp: float, depth: float) -> list[Link]:
+    """Return what odometry says, as surely as a solution that hardly heard it bears out (``T_solved`` T_map_cam).
+
+    Odometry allows for more than it mostly errs by, and the middle of what it differs by from the solution, which errs
+    too, says how much more at most; single motions that are worse are left to a robust kernel. But odometry took the
+    depths at their word: where these, ``depth`` in the median, are warped by the share ``warp``, it took parallax for
+    turns and motions for longer than they were.
+    """
+    chi2 = []
+    for first, second, T, covariance in links:
+        E = se3.inverse(T) @ se3.inverse(T_solved[first]) @ T_solved[second]
+        error = np.concatenate([se3.log_rotation(E[:3, :3]), E[:3, 3]])
+        chi2.append(float(error @ np.linalg.solve(covariance, error)))
+    share = float(np.clip(np.median(chi2) / MIDDLE_CHI2, LEAST_SHARE, 1.0))
+    out = []
+    for first, second, T, covariance in links:
+        bent = warp * float(np.linalg.norm(T[:3, 3]))
+        out.append((first, second, T, share * covariance + np.diag(np.repeat([(bent / depth) ** 2, bent**2], 3))))
+    return out
 
 
 def motion_covariances(

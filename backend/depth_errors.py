@@ -32,10 +32,14 @@ ROUNDS: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """Inverse depths (M,) with the field taken out, NaN where a reading is missing or wrong; deviation of one."""
+    """Inverse depths (M,) with the field taken out, NaN where a reading is missing or wrong; deviation of one.
+
+    ``warp`` is how large the field is (root mean square), as a share of the median inverse depth.
+    """
 
     inverse: Array
     sigma: float
+    warp: float = 0.0
 
 
 def parallax_sigma(centres: Array, points: Array, track: Rows, sigma_px: float, focal_px: Array) -> Array:
@@ -97,7 +101,8 @@ def measure(
         return Depths(inverse, USUAL * middle)
     wrong = known & (np.abs(difference - field) > WRONG * np.hypot(noise, sigma))
     corrected = np.where(wrong, np.nan, inverse - field)
-    return Depths(np.where(corrected > 0, corrected, np.nan), noise)
+    warp = float(np.sqrt(np.mean(field[known] ** 2))) / middle
+    return Depths(np.where(corrected > 0, corrected, np.nan), noise, warp)
 
 
 def _by_camera(camera: Rows, count: int) -> list[tuple[int, Rows]]:
