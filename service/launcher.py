@@ -20,7 +20,7 @@ from seamark.service.nodes.meter import usage_of
 from seamark.service.nodes.process import write_settings
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty, Status
-from seamark.service.topics import BACKEND, FRONTEND, KEYFRAME, NODES, PROGRESS, RUNNER, VOCAB
+from seamark.service.topics import BACKEND, FRONTEND, KEYFRAME, NODES, PROGRESS, RUNNER, STOPPING, VOCAB
 from seamark.service.types import ProcessUsage
 from seamark.service.zenoh_bus import ZenohBus
 from seamark.service.zenoh_session import SessionError, Watch, free_endpoint, open_session, who_lives
@@ -153,6 +153,7 @@ class Launcher:
         """
         with self._lock:
             self._stopping = True
+        self._announce_stop()
         began, patience_s = time.monotonic(), STOP_TIMEOUT_S if gently else STOP_TIMEOUT_S / 2
         for name in NODES:
             self._stop_child(name, began + patience_s * STOP_SHARES[name])
@@ -162,6 +163,12 @@ class Launcher:
         if closing.is_alive():
             logger.warning("the session does not close, and ends with this process")
         return self.usage()
+
+    def _announce_stop(self) -> None:
+        """Have the back end store what is on its way and map it another time."""
+        if self._bus is not None:
+            with contextlib.suppress(BusError):
+                self._bus.request_async(STOPPING, Empty())
 
     def _close(self) -> None:
         for one in (self._bus, self._watch, self._session):

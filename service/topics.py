@@ -245,6 +245,19 @@ PROGRESS = {
     for node in (VOCAB, BACKEND)
 }
 
+STOPPING = Topic(
+    "stopping",
+    "stopping/backend",
+    Kind.REQUEST,
+    Empty,
+    RUNNER,
+    (BACKEND,),
+    2,
+    "The service stops: for ten seconds keyframes are stored at once, and mapped after the next start.",
+    reply=Done,
+    timeout_s=2.0,
+)
+
 #: All topics, in the order of the documentation.
 TOPICS: tuple[Topic, ...] = (
     FRAME,
@@ -261,6 +274,7 @@ TOPICS: tuple[Topic, ...] = (
     *DRAIN.values(),
     *STATUS.values(),
     *PROGRESS.values(),
+    STOPPING,
 )
 
 

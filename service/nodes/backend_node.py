@@ -1,5 +1,6 @@
 """The back end as a node: keyframes and candidates in; loops, the map and places out."""
 
+import logging
 import threading
 import time
 from collections.abc import Collection
@@ -19,12 +20,13 @@ from seamark.frontend.camera import Camera
 from seamark.frontend.config import FrontendConfig
 from seamark.frontend.types import Keyframe, Mode
 from seamark.service import topics
-from seamark.service.bus import Bus
+from seamark.service.bus import Bus, BusError
 from seamark.service.nodes.map_keeper import MapKeeper
 from seamark.service.nodes.map_opening import open_map
 from seamark.service.nodes.map_pruner import MapPruner
 from seamark.service.nodes.meter import Meter
 from seamark.service.nodes.places import PlaceService
+from seamark.service.nodes.places_cache import observe
 from seamark.service.nodes.process import run_process
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.process_end import leave
@@ -33,6 +35,9 @@ from seamark.vocab.types import Candidates, PlaceObservation
 
 PLACE_WORKERS = 2
 STOP_PATIENCE_S = 0.5
+STORING_S = 10.0  # for which the order to store alone holds: whoever gave it may not be the service
+
+logger = logging.getLogger(__name__)
 
 
 class BackendNode:
@@ -75,6 +80,8 @@ class BackendNode:
         self._next_session = 0
         self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
         self._candidates: dict[int, tuple[Candidates, Future[None]]] = {}
+        self._left: set[int] = set()  # by an earlier life, whose candidates nobody will send
+        self._storing_until = 0.0  # time.monotonic: keyframes are stored and not mapped
         if store is not None:
             self._restore(store, passing)
         place_service = PlaceService(places, camera, self._rank, slam.locate)
@@ -82,6 +89,7 @@ class BackendNode:
         bus.handle(topics.STATUS[bus.node], lambda _: self._status(), workers=1)
         bus.handle(topics.PROGRESS[bus.node], lambda _: self._status())
         bus.handle(topics.MAP_SNAPSHOT, lambda _: self._slam.snapshot(), workers=1)
+        bus.handle(topics.STOPPING, self._on_stopping, workers=1)
         bus.handle(topics.PLACE, place_service.answer, workers=PLACE_WORKERS)
         bus.handle(topics.CANDIDATES, self._on_candidates)
         bus.handle(topics.KEYFRAME, self._on_keyframe)
@@ -93,7 +101,7 @@ class BackendNode:
         """
         deadline = time.monotonic() + STOP_PATIENCE_S
         with self._lock:
-            for keyframe_id in list(self._waiting):
+            for keyframe_id in self._mappable():
                 if time.monotonic() > deadline:
                     break
                 self._map(keyframe_id)
@@ -132,6 +140,7 @@ class BackendNode:
         for keyframe in (*before, *waiting):
             self._remember(keyframe)
         self._waiting |= {keyframe.id: keyframe for keyframe in waiting}
+        self._left = set(self._waiting)
         self._meter.keep("keyframes_restored", len(before))
 
     def _remember(self, keyframe: Keyframe) -> None:
@@ -179,26 +188,34 @@ class BackendNode:
                 return None
             mapped: Future[None] = Future()
             self._candidates[keyframe_id] = candidates, mapped
+            if time.monotonic() < self._storing_until:
+                return None  # their keyframe is on disk, or comes to be, and finds them again
             self._map_ready()
         return mapped
 
     def _map_ready(self) -> None:
-        """Map waiting keyframes, the oldest first, as far as their candidates have come.
+        """Map waiting keyframes, the oldest first, as far as their candidates have come."""
+        for keyframe_id in self._mappable():
+            if time.monotonic() < self._storing_until:
+                return
+            self._map(keyframe_id)
+
+    def _mappable(self) -> list[int]:
+        """Return the waiting keyframes that need not wait for their candidates any more.
 
         Candidates come in the order of the keyframes: those of an older one will never come once a newer one's are here
         (the vocabulary has refused that keyframe).
         """
         newest = max(self._candidates, default=-1)
-        for keyframe_id in list(self._waiting):
-            if not self._no_loops and keyframe_id > newest:
-                return
-            self._map(keyframe_id)
+        return [keyframe_id for keyframe_id in self._waiting if self._no_loops or keyframe_id <= newest]
 
     def _map(self, keyframe_id: int) -> None:
         keyframe = self._waiting.pop(keyframe_id)
         for old in [number for number in self._candidates if number < keyframe_id]:
             self._candidates.pop(old)[1].set_result(None)  # of a keyframe that never came
         candidates, mapped = self._candidates.pop(keyframe_id, (None, Future[None]()))
+        if candidates is None and keyframe_id in self._left and not self._no_loops:
+            candidates = self._ask_again(keyframe)
         if candidates is None or self._no_loops:
             self._meter.count("candidates_ignored" if self._no_loops else "candidates_missing")
             candidates = Candidates(keyframe_id, keyframe.stamp_ns, ())
@@ -237,6 +254,20 @@ class BackendNode:
         self._meter.count("place_queries")
         ranked: Candidates = self._bus.request(topics.PLACES_RANK, observation)
         return ranked
+
+    def _ask_again(self, keyframe: Keyframe) -> Candidates | None:
+        """Return the candidates of a keyframe that an earlier life has left unmapped, None where nobody knows."""
+        try:
+            candidates: Candidates = self._bus.request(topics.PLACES_RANK, observe(keyframe))
+        except BusError as error:
+            logger.warning("keyframe %d is mapped without candidates: %s", keyframe.id, error)
+            return None
+        self._meter.count("candidates_asked_again")
+        return candidates
+
+    def _on_stopping(self, _: object) -> Done:
+        self._storing_until = time.monotonic() + STORING_S
+        return Done(self._bus.node)
 
     def _on_drain(self, _: object) -> Done:
         self.settle()

@@ -1,5 +1,6 @@
 """The three nodes on a LocalBus: what they send, in which order, and what they do with what goes wrong."""
 
+import time
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from seamark.frontend.odometry import Frontend, FrontendResult
 from seamark.frontend.types import Camera, Features, Filled, Frame, Keyframe, Mode, Odometry, Outcome, Quality
 from seamark.service import topics
 from seamark.service.bus import LocalBus, RemoteError
+from seamark.service.nodes import backend_node
 from seamark.service.nodes.backend_node import BackendNode
 from seamark.service.nodes.frontend_node import FrontendNode
 from seamark.service.nodes.places_cache import observe
@@ -31,7 +33,7 @@ from seamark.service.nodes.vocab_node import VocabNode
 from seamark.service.requests import Done, Empty, EncodedFrame, PlaceError, PlaceQuery
 from seamark.vocab.place_index import PlaceIndex
 from seamark.vocab.training import train
-from seamark.vocab.types import Candidate, Candidates
+from seamark.vocab.types import Candidate, Candidates, PlaceObservation
 from seamark.vocab.vocabulary import Vocabulary
 
 GREY = np.zeros((4, 6), np.uint8)
@@ -181,6 +183,42 @@ def test_a_restarted_back_end_takes_in_its_map_and_waits_for_what_was_not_mapped
     assert third.slam.restored == ([0, 1, 2, 3], [(1, 0), (2, 1)])
     third.node.stop()
     assert third.slam.finished == 0  # nothing new
+
+
+def test_a_stopping_back_end_stores_at_once_and_maps_in_its_next_life(tmp_path: Path) -> None:
+    """Test: keyframes and candidates come while the service stops. Expected: all acknowledged and on disk; mapped is
+    what has its candidates, in the end or after the next start, whose vocabulary is asked for them again.
+    """
+    first = Backend(tmp_path)
+    first.send(keyframe(0), candidates(0))
+    first.bus.request(topics.STOPPING, Empty())
+    first.send(keyframe(1), candidates(1, 0), keyframe(2))
+    assert first.slam.steps == [(0, ())] and [one.id for one in first.store.load_keyframes()] == [0, 1, 2]
+    first.node.stop()
+    assert first.slam.steps == [(0, ()), (1, (0,))]
+    first.node.close()
+    second = Backend(tmp_path)
+    asked: list[int] = []
+
+    def rank(observation: PlaceObservation) -> Candidates:
+        asked.append(observation.id)
+        return candidates(observation.id, 0, 1)
+
+    second.bus.for_node("vocab").handle(topics.PLACES_RANK, rank)
+    second.send(keyframe(3), candidates(3))
+    assert second.slam.steps == [(2, (0, 1)), (3, ())] and asked == [2]
+    assert second.counters()["candidates_asked_again"] == 1
+
+
+def test_the_order_to_store_alone_does_not_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend_node, "STORING_S", 0.05)
+    backend = Backend(tmp_path)
+    backend.bus.request(topics.STOPPING, Empty())
+    backend.send(keyframe(0), candidates(0))
+    assert backend.slam.steps == []
+    time.sleep(0.06)
+    backend.send(keyframe(1), candidates(1, 0))
+    assert backend.slam.steps == [(0, ()), (1, (0,))]
 
 
 def test_a_keyframe_that_the_vocabulary_refused_is_mapped_without_candidates(tmp_path: Path) -> None:
@@ -428,7 +466,9 @@ def test_a_keyframe_sent_again_is_ranked_and_not_added_again(vocabulary: Vocabul
 
 
 def test_a_budget_is_kept_and_the_vocabulary_forgets_too(vocabulary: Vocabulary, tmp_path: Path) -> None:
-    """Test: 41 like views come in, room is for 10. Expected: the newest stay in file, index and memory."""
+    """Test: 42 like views come in, room is for 10. Expected: the newest stay in file, index and memory: what is chosen
+    after one keyframe goes after the next.
+    """
     bus, slam = LocalBus(), FakeSlam()
     index = PlaceIndex(vocabulary)
     VocabNode(bus.for_node("vocab"), index)
@@ -437,7 +477,7 @@ def test_a_budget_is_kept_and_the_vocabulary_forgets_too(vocabulary: Vocabulary,
     node = BackendNode(bus.for_node("backend"), slam, store, FrontendConfig(), limits=limits)
     rng = np.random.default_rng(0)
     T = np.eye(4)
-    for number in range(20, 61):
+    for number in range(20, 62):
         seen = Features(
             rng.random((20, 2)).astype(np.float32),
             np.ones(20, np.float32),
@@ -453,12 +493,12 @@ def test_a_budget_is_kept_and_the_vocabulary_forgets_too(vocabulary: Vocabulary,
         store.update_poses(MapSnapshot(1, ids, ids * 0, ids * 0, poses, np.ones(len(ids)), ()))
     bus.drain()
     kept = store.keyframe_ids(recognisable=True)
-    assert 20 <= len(kept) <= 10 + 20 and store.keyframe_ids() == kept  # the newest twenty are spared
-    assert {41, 60} <= set(kept)
-    assert [number in index for number in range(20, 61)] == [number in kept for number in range(20, 61)]
+    assert 20 <= len(kept) <= 10 + 21 and store.keyframe_ids() == kept  # the newest twenty are spared
+    assert {41, 61} <= set(kept)
+    assert [number in index for number in range(20, 62)] == [number in kept for number in range(20, 62)]
     assert [node.id for node in slam.nodes] == kept
     counters = bus.request(topics.STATUS["backend"], Empty()).counters
-    assert counters["views_forgotten"] == 41 - len(kept) and counters["views_over_budget"] == len(kept) - 9
+    assert counters["views_forgotten"] == 42 - len(kept) and counters["views_over_budget"] == len(kept) - 1 - 9
     node.close()
 
 
