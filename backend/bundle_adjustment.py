@@ -17,13 +17,13 @@ from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from seamark.backend.bundle_links import followers, measured, motion_covariances, odometry_links, pose_of, reweighed
+from seamark.backend.bundle_observations import Observations
 from seamark.backend.config import BackendConfig
 from seamark.backend.depth_errors import Depths, measure, parallax_sigma
 from seamark.backend.errors import SolverError
 from seamark.backend.graph_types import Constraint
 from seamark.backend.tracks import Tracks, find_tracks, neighbours, relative_pose
 from seamark.backend.types import Loop
-from seamark.frontend import se3
 from seamark.frontend.camera import Camera
 from seamark.frontend.types import Keyframe
 
@@ -91,16 +91,16 @@ def adjust(
     if tracks.count < 10:
         raise SolverError(f"{tracks.count} landmarks are seen by two keyframes of {len(known)}: too few to adjust")
     problem = _Problem(known, T_map_cam, scales, tracks, closed, config)
-    start = problem.initial()
+    start = problem.seen.initial(T_map_cam)
     kept = np.ones(len(tracks.track), bool)
     first = problem.solve(start, kept, FIRST_TOLERANCE)
-    kept = problem.within(first.values, OUTLIER)
+    kept = problem.within(first.values)
     problem.learn_noise(first.values, kept)
     problem.learn_depth(first.values, kept)
     problem.learn_odometry(first.values)
     second = problem.solve(first.values, kept)
     values = second.values
-    before, after = (np.minimum(problem.errors_px(which)[kept], LOST_PX) for which in (start, values))
+    before, after = (np.minimum(problem.seen.errors_px(which)[kept], LOST_PX) for which in (start, values))
     ids = np.array(sorted(known), np.int64)
     poses = np.stack([values.atPose3(X(number)).matrix() for number in ids.tolist()])
     if not np.isfinite(poses).all():
@@ -141,15 +141,8 @@ class _Problem:
         config: BackendConfig,
     ) -> None:
         self._keyframes, self._T, self._tracks, self._config = keyframes, T_map_cam, tracks, config
-        pixels = np.empty((len(tracks.track), 2))
-        points = np.full((len(tracks.track), 3), np.nan)  # in the camera's frame, in map units
-        for number, keyframe in keyframes.items():
-            mine = tracks.keyframe == number
-            assert keyframe.camera is not None
-            pixels[mine] = keyframe.camera.undistort(keyframe.features.points[tracks.feature[mine]])
-            points[mine] = keyframe.landmarks[tracks.feature[mine]].astype(np.float64) * scales[number]
-        self._pixels, self._points, self._scales = pixels, points, scales
-        inverse = 1 / points[:, 2]
+        self.seen, self._scales = Observations(keyframes, tracks, scales), scales
+        inverse = 1 / self.seen.points[:, 2]
         usual = float(np.nanmedian(inverse)) if np.isfinite(inverse).any() else 1.0
         self._depths = Depths(inverse, WEAK_DEPTH * usual)
         self._metric = all(keyframe.metric for keyframe in keyframes.values())
@@ -161,48 +154,38 @@ class _Problem:
         self._spread = float(np.sqrt(1 + max(in_common, 0.0)))
         self._cameras = {number: _calibration(keyframe) for number, keyframe in keyframes.items()}
 
-    def initial(self) -> gtsam.Values:
-        """Return the map's poses, and each track's landmark as the middle of what its keyframes say."""
-        values = gtsam.Values()
-        for number in self._keyframes:
-            T = self._T[number]
-            values.insert(X(number), gtsam.Pose3(gtsam.Rot3.ClosestTo(T[:3, :3]), T[:3, 3]))
-        world = np.full((len(self._pixels), 3), np.nan)
-        for number in self._keyframes:
-            mine = self._tracks.keyframe == number
-            world[mine] = se3.transform(self._T[number], self._points[mine])
-        for track, rows in self._rows():
-            values.insert(L(track), np.nanmedian(world[rows], axis=0))
-        return values
+    def within(self, values: gtsam.Values) -> NDArray[np.bool_]:
+        """Return which observations (M,) are no outliers."""
+        return self.seen.within(values, OUTLIER, self._sigma_px)
 
     def learn_noise(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
         """Take the noise of key points from what a solution leaves, if that is more than expected."""
-        left = float(np.median(self.errors_px(values)[kept])) / RAYLEIGH
+        left = float(np.median(self.seen.errors_px(values)[kept])) / RAYLEIGH
         self._sigma_px = max(self._sigma_px, left)
 
     def learn_depth(self, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
         """Take the warp and the noise of depth from a solution that hardly looked at it."""
-        if not self._metric or not np.isfinite(self._points[:, 2]).any():
+        if not self._metric or not np.isfinite(self.seen.points[:, 2]).any():
             return
-        centres, focal = np.zeros((len(self._pixels), 3)), np.zeros(len(self._pixels))
+        centres, focal = np.zeros((len(self.seen.pixels), 3)), np.zeros(len(self.seen.pixels))
         models: dict[Camera, int] = {}
-        camera = np.zeros(len(self._pixels), np.int64)
+        camera = np.zeros(len(self.seen.pixels), np.int64)
         for number, keyframe in self._keyframes.items():
             mine = self._tracks.keyframe == number
             assert keyframe.camera is not None
             centres[mine], focal[mine] = values.atPose3(X(number)).translation(), keyframe.camera.fx
             camera[mine] = models.setdefault(keyframe.camera, len(models))
-        points = self._landmarks(values)[self._tracks.track]
+        points = self.seen.landmarks(values)[self._tracks.track]
         sigma = parallax_sigma(centres, points, self._tracks.track, self._sigma_px, focal)
-        solved = 1 / self._solved_depths(values)
-        inverse = 1 / self._points[:, 2]
-        self._depths = measure(inverse, solved, sigma, kept, self._pixels, list(models), camera, self._spread)
+        solved = 1 / self.seen.depths(values)
+        inverse = 1 / self.seen.points[:, 2]
+        self._depths = measure(inverse, solved, sigma, kept, self.seen.pixels, list(models), camera, self._spread)
 
     def learn_odometry(self, values: gtsam.Values) -> None:
         """Take from the same solution how much odometry errs."""
         if self._steps:
             solved = {number: values.atPose3(X(number)).matrix() for number in self._keyframes}
-            z = self._points[:, 2]
+            z = self.seen.points[:, 2]
             depth = float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
             self._steps = reweighed(self._steps, solved, self._depths.warp, depth)
 
@@ -215,22 +198,13 @@ class _Problem:
         if self._metric:
             return scales
         with np.errstate(invalid="ignore"):
-            ratio = self._solved_depths(values) / self._points[:, 2]
+            ratio = self.seen.depths(values) / self.seen.points[:, 2]
         for row, number in enumerate(sorted(self._keyframes)):
             mine = ratio[kept & (self._tracks.keyframe == number)]
             mine = mine[np.isfinite(mine) & (mine > 0)]
             if len(mine) >= HELD_BY:
                 scales[row] *= float(np.median(mine))
         return scales
-
-    def _solved_depths(self, values: gtsam.Values) -> NDArray[np.float64]:
-        """Return where (M,) a solution has each observation's landmark along the camera's axis, NaN behind it."""
-        points = self._landmarks(values)[self._tracks.track]
-        out = np.full(len(points), np.nan)
-        for number in self._keyframes:
-            mine = self._tracks.keyframe == number
-            out[mine] = se3.transform(se3.inverse(values.atPose3(X(number)).matrix()), points[mine])[:, 2]
-        return np.where(out > 1e-6, out, np.nan)
 
     def solve(self, start: gtsam.Values, kept: NDArray[np.bool_], tolerance: float = 1e-5) -> _Solution:
         """Return the solution with the kept observations."""
@@ -244,7 +218,7 @@ class _Problem:
         for row, track, number in zip(
             np.flatnonzero(kept), self._tracks.track[kept].tolist(), self._tracks.keyframe[kept].tolist(), strict=True
         ):
-            u, v = self._pixels[row]
+            u, v = self.seen.pixels[row]
             mono, stereo = self._cameras[number]
             inverse = self._depths.inverse[row]
             if self._metric and np.isfinite(inverse):
@@ -269,42 +243,6 @@ class _Problem:
         except RuntimeError as error:
             raise SolverError(f"the adjustment of {len(poses)} keyframes has no solution: {error}") from error
         return _Solution(solved, graph, int(optimizer.iterations()))
-
-    def errors_px(self, values: gtsam.Values) -> NDArray[np.float64]:
-        """Return reprojection errors (M,); infinite for landmarks that the values lack or behind the camera."""
-        out = np.full(len(self._pixels), np.inf)
-        points = self._landmarks(values)
-        for number, keyframe in self._keyframes.items():
-            mine = np.flatnonzero(self._tracks.keyframe == number)
-            T = se3.inverse(values.atPose3(X(number)).matrix())
-            p = se3.transform(T, points[self._tracks.track[mine]])
-            ahead = p[:, 2] > 1e-6
-            assert keyframe.camera is not None
-            uv = keyframe.camera.project_ideal(p[ahead])
-            out[mine[ahead]] = np.linalg.norm(uv - self._pixels[mine[ahead]], axis=1)
-        return out
-
-    def _landmarks(self, values: gtsam.Values) -> Matrix:
-        """Return the landmark (3,) of each track, NaN where the values have none."""
-        points = np.full((int(self._tracks.track.max()) + 1, 3), np.nan)
-        for track in range(len(points)):
-            if values.exists(L(track)):
-                points[track] = values.atPoint3(L(track))
-        return points
-
-    def within(self, values: gtsam.Values, sigmas: float) -> NDArray[np.bool_]:
-        """Return which observations (M,) are no outliers and belong to a landmark with at least two such."""
-        errors = self.errors_px(values)
-        typical = max(self._sigma_px, float(np.median(errors[np.isfinite(errors)])))
-        good: NDArray[np.bool_] = errors < sigmas * typical
-        count = np.bincount(self._tracks.track[good], minlength=int(self._tracks.track.max()) + 1)
-        return np.asarray(good & (count[self._tracks.track] >= 2))
-
-    def _rows(self) -> list[tuple[int, NDArray[np.int64]]]:
-        """Return for each track which observations are its."""
-        starts = np.flatnonzero(np.r_[True, np.diff(self._tracks.track) > 0])
-        ends = np.r_[starts[1:], len(self._tracks.track)]
-        return [(int(self._tracks.track[a]), np.arange(a, b)) for a, b in zip(starts, ends, strict=True)]
 
     def _depth_noise(self, robust: gtsam.noiseModel.mEstimator.Base, sigma: float) -> dict[int, gtsam.noiseModel.Base]:
         """Return for each keyframe the noise of (left, right, row): right is left less the disparity."""
