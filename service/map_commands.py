@@ -51,11 +51,7 @@ def check_command(map_file: MapArgument, as_json: JsonOption = False) -> None:
 
 
 @map_app.command("repair")
-def repair_command(
-    map_file: MapArgument,
-    out: NewMapOption,
-    as_json: JsonOption = False,
-) -> None:
+def repair_command(map_file: MapArgument, out: NewMapOption, as_json: JsonOption = False) -> None:
     """Save all that is whole in a damaged map (or one of an earlier version) to a new file, and say what is lost."""
     from seamark.backend.map_repair import repair_map
     from seamark.service import map_report
@@ -68,11 +64,7 @@ def repair_command(
 
 
 @map_app.command("backup")
-def backup_command(
-    map_file: MapArgument,
-    out: NewMapOption,
-    as_json: JsonOption = False,
-) -> None:
+def backup_command(map_file: MapArgument, out: NewMapOption, as_json: JsonOption = False) -> None:
     """Copy a map as it is at this moment. A service may be writing it meanwhile, and is not held up."""
     from seamark.backend.map_backup import back_up_map
 

@@ -21,6 +21,7 @@ from seamark.frontend.config import FrontendConfig
 from seamark.frontend.types import Keyframe, Mode
 from seamark.service import topics
 from seamark.service.bus import Bus, BusError
+from seamark.service.nodes.keyframe_queue import KeyframeQueue
 from seamark.service.nodes.map_keeper import MapKeeper
 from seamark.service.nodes.map_opening import open_map
 from seamark.service.nodes.map_pruner import MapPruner
@@ -75,12 +76,9 @@ class BackendNode:
             self._pruner = MapPruner(self._keeper, slam, limits or MapConfig(), self._meter, self._forget)
         self._lock = threading.RLock()  # stop comes from another thread than the messages
         self._settled = True
-        self._refused: set[int] = set()
         self._next_keyframe_id = 0
         self._next_session = 0
-        self._waiting: dict[int, Keyframe] = {}  # in the order of arrival, which is that of the keyframes
-        self._candidates: dict[int, tuple[Candidates, Future[None]]] = {}
-        self._left: set[int] = set()  # by an earlier life, whose candidates nobody will send
+        self._queue = KeyframeQueue()
         self._storing_until = 0.0  # time.monotonic: keyframes are stored and not mapped
         if store is not None:
             self._restore(store, passing)
@@ -111,7 +109,7 @@ class BackendNode:
     def settle(self) -> None:
         """Map what is waiting, settle what is undecided, and write the poses; it may take its time."""
         with self._lock:
-            for keyframe_id in list(self._waiting):
+            for keyframe_id in self._queue.everyone():
                 self._map(keyframe_id)
             if self._settled:
                 return
@@ -139,8 +137,7 @@ class BackendNode:
             before, waiting = before + own, waiting + waiting_own
         for keyframe in (*before, *waiting):
             self._remember(keyframe)
-        self._waiting |= {keyframe.id: keyframe for keyframe in waiting}
-        self._left = set(self._waiting)
+        self._queue.restore(waiting)
         self._meter.keep("keyframes_restored", len(before))
 
     def _remember(self, keyframe: Keyframe) -> None:
@@ -159,10 +156,10 @@ class BackendNode:
                     with self._meter.timed("store"):
                         self._keeper.add_keyframe(keyframe)
                 except MapError:
-                    self._refuse(keyframe.id)
+                    self._queue.refuse(keyframe.id)
                     raise
             self._remember(keyframe)
-            self._waiting[keyframe.id] = keyframe
+            self._queue.add(keyframe)
             self._settled = False
             self._meter.count("keyframes")
             self._map_ready()
@@ -173,21 +170,14 @@ class BackendNode:
         self._meter.keep_refused(self._bus.refused)
         return self._meter.status()
 
-    def _refuse(self, keyframe_id: int) -> None:
-        """Let nobody wait for a keyframe that the disk has refused."""
-        self._refused.add(keyframe_id)
-        if keyframe_id in self._candidates:
-            self._candidates.pop(keyframe_id)[1].set_result(None)
-
     def _on_candidates(self, candidates: Candidates) -> "Future[None] | None":
         keyframe_id = candidates.query_id
         with self._lock:
-            mapped_before = keyframe_id < self._next_keyframe_id and keyframe_id not in self._waiting
-            if mapped_before or keyframe_id in self._refused:
+            mapped_before = keyframe_id < self._next_keyframe_id and keyframe_id not in self._queue
+            if mapped_before or self._queue.refused(keyframe_id):
                 self._meter.count("candidates_again")
                 return None
-            mapped: Future[None] = Future()
-            self._candidates[keyframe_id] = candidates, mapped
+            mapped = self._queue.put(candidates)
             if time.monotonic() < self._storing_until:
                 return None  # their keyframe is on disk, or comes to be, and finds them again
             self._map_ready()
@@ -201,20 +191,13 @@ class BackendNode:
             self._map(keyframe_id)
 
     def _mappable(self) -> list[int]:
-        """Return the waiting keyframes that need not wait for their candidates any more.
-
-        Candidates come in the order of the keyframes: those of an older one will never come once a newer one's are here
-        (the vocabulary has refused that keyframe).
-        """
-        newest = max(self._candidates, default=-1)
-        return [keyframe_id for keyframe_id in self._waiting if self._no_loops or keyframe_id <= newest]
+        """Return the waiting keyframes that need not wait for their candidates any more."""
+        return self._queue.everyone() if self._no_loops else self._queue.ready()
 
     def _map(self, keyframe_id: int) -> None:
-        keyframe = self._waiting.pop(keyframe_id)
-        for old in [number for number in self._candidates if number < keyframe_id]:
-            self._candidates.pop(old)[1].set_result(None)  # of a keyframe that never came
-        candidates, mapped = self._candidates.pop(keyframe_id, (None, Future[None]()))
-        if candidates is None and keyframe_id in self._left and not self._no_loops:
+        arrived = self._queue.take(keyframe_id)
+        keyframe, candidates, mapped = arrived.keyframe, arrived.candidates, arrived.mapped
+        if candidates is None and arrived.left and not self._no_loops:
             candidates = self._ask_again(keyframe)
         if candidates is None or self._no_loops:
             self._meter.count("candidates_ignored" if self._no_loops else "candidates_missing")
