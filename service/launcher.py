@@ -2,22 +2,17 @@
 
 import contextlib
 import logging
-import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
 
-import psutil
-
 from seamark.service.bus import BusError
-from seamark.service.nodes.meter import usage_of
-from seamark.service.nodes.process import write_settings
+from seamark.service.node_process import NodeProcess
 from seamark.service.nodes.settings import NodeSettings
 from seamark.service.requests import Empty, Status
 from seamark.service.topics import BACKEND, FRONTEND, KEYFRAME, NODES, PROGRESS, RUNNER, STOPPING, VOCAB
@@ -40,8 +35,6 @@ RESTARTS_WITHIN_S = 600.0
 PROGRESS_EVERY_S = 0.1
 # More keyframes than a front end can have announced without having handed them over.
 LOST_KEYFRAMES = 4 * KEYFRAME.depth
-# One thread per process and library: OpenCV, BLAS and OpenMP would otherwise fight for the same cores.
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 class NodeFailedError(BusError):
@@ -50,19 +43,6 @@ class NodeFailedError(BusError):
 
 class StartInterruptedError(BusError):
     """The service was told to stop before its nodes were alive."""
-
-
-@dataclass
-class _Child:
-    """One process of a node and the thread that waits for its end."""
-
-    name: str
-    process: subprocess.Popen[bytes]
-    ended: threading.Event
-    exit_code: int | None = None
-    last_word: str = ""
-    peak_rss_bytes: int = 0
-    cpu_s: float = 0.0
 
 
 class Launcher:
@@ -95,8 +75,8 @@ class Launcher:
             name: (sys.executable, "-m", f"seamark.service.nodes.{name}_node") for name in NODES
         }
         self._lock = threading.RLock()
-        self._children: dict[str, _Child] = {}
-        self._ended: list[_Child] = []
+        self._running: dict[str, NodeProcess] = {}
+        self._started: list[NodeProcess] = []
         self._stopping = False
         self._failure: NodeFailedError | None = None
         self.restarts = dict.fromkeys(NODES, 0)
@@ -138,7 +118,7 @@ class Launcher:
     def process_id(self, node: str) -> int:
         """Return the process id of a node."""
         with self._lock:
-            return self._children[node].process.pid
+            return self._running[node].pid
 
     def wait_until_alive(self, timeout_s: float = START_TIMEOUT_S) -> None:
         """Wait until all nodes answer; raises NodeFailedError or TimedOutError."""
@@ -156,7 +136,7 @@ class Launcher:
         self._announce_stop()
         began, patience_s = time.monotonic(), STOP_TIMEOUT_S if gently else STOP_TIMEOUT_S / 2
         for name in NODES:
-            self._stop_child(name, began + patience_s * STOP_SHARES[name])
+            self._stop_node(name, began + patience_s * STOP_SHARES[name])
         closing = threading.Thread(target=self._close, name="close", daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
@@ -179,11 +159,11 @@ class Launcher:
     def usage(self) -> tuple[ProcessUsage, ...]:
         """Return what the processes that have ended have used, restarts of one node together."""
         with self._lock:
-            ended = list(self._ended)
+            ended = [process for process in self._started if process.ended.is_set()]
         return tuple(
-            ProcessUsage(name, max(child.peak_rss_bytes for child in mine), sum(child.cpu_s for child in mine))
+            ProcessUsage(name, max(one.peak_rss_bytes for one in mine), sum(one.cpu_s for one in mine))
             for name in NODES
-            if (mine := [child for child in ended if child.name == name])
+            if (mine := [one for one in ended if one.name == name])
         )
 
     def _open(self) -> None:
@@ -213,54 +193,34 @@ class Launcher:
             raise StartInterruptedError("stopped before the nodes were alive")
 
     def _start(self, name: str, settings: NodeSettings) -> None:
-        process = subprocess.Popen(
-            self._commands[name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1"),
-            start_new_session=True,  # Ctrl-C is for the parent, which stops the nodes in order
-        )
-        child = self._children[name] = _Child(name, process, threading.Event())
-        threading.Thread(target=self._follow, args=(child,), name=f"follow-{name}", daemon=True).start()
-        assert process.stdin is not None
-        try:
-            write_settings(process.stdin, settings)  # type: ignore[arg-type]
-        except BrokenPipeError:
-            logger.debug("%s ended before it read its settings", name)
+        """Start a node; to be called with the lock, so that its end is not noticed before it is known."""
+        process = self._running[name] = NodeProcess(name, self._commands[name], settings, self._on_end)
+        self._started.append(process)
 
-    def _follow(self, child: _Child) -> None:
-        """Wait for the end of a process, book what it has used, and restart it if it should live."""
-        os.waitid(os.P_PID, child.process.pid, os.WEXITED | os.WNOWAIT)
-        lines = _what_was_said(child.process).splitlines()
-        with self._lock:  # from here on the process id may be another's
-            _, status, usage = os.wait4(child.process.pid, 0)
-            child.exit_code = child.process.returncode = os.waitstatus_to_exitcode(status)
-            child.last_word = lines[-1] if lines else f"exit code {child.exit_code}"
-            # The kernel's maximum begins with what this process had when it started the child: an upper bound only.
-            child.peak_rss_bytes = child.peak_rss_bytes or 1024 * usage.ru_maxrss
-            child.cpu_s = usage.ru_utime + usage.ru_stime
-            self._ended.append(child)
-            self._children.pop(child.name, None)
+    def _on_end(self, process: NodeProcess) -> None:
+        """Start a node again that should live."""
+        with self._lock:
+            if self._running.get(process.name) is process:
+                del self._running[process.name]
             if self._watch is not None:
-                self._watch.forget(child.name)
-            child.ended.set()
+                self._watch.forget(process.name)
             if self._stopping:
                 return
-        self._replace(child)
+        self._replace(process)
 
-    def _replace(self, child: _Child) -> None:
-        sentence = f"the {child.name} node has ended: {child.last_word}"
+    def _replace(self, ended: NodeProcess) -> None:
+        sentence = f"the {ended.name} node has ended: {ended.last_word}"
         now = time.monotonic()
-        lately = [at for at in self._restarted_at[child.name] if at > now - RESTARTS_WITHIN_S]
+        lately = [at for at in self._restarted_at[ended.name] if at > now - RESTARTS_WITHIN_S]
         # An error that it could name would come again; only what was killed or crashed is worth another try.
-        if child.exit_code == 1 or len(lately) >= self._max_restarts:
+        if ended.exit_code == 1 or len(lately) >= self._max_restarts:
             self._failure = NodeFailedError(sentence)
             return
-        self._restarted_at[child.name] = [*lately, now]
+        self._restarted_at[ended.name] = [*lately, now]
         logger.warning("%s; it is started again", sentence)
         with self._lock:
             self._settings = replace(self._settings, restore=self._settings.map_path is not None)
-        if child.name == FRONTEND:
+        if ended.name == FRONTEND:
             try:
                 self._counting_on(LOST_KEYFRAMES)
             except NodeFailedError as error:
@@ -269,9 +229,9 @@ class Launcher:
         with self._lock:
             if self._stopping:
                 return
-            self.restarts[child.name] += 1
+            self.restarts[ended.name] += 1
             try:
-                self._start(child.name, self._settings)
+                self._start(ended.name, self._settings)
             except OSError as error:  # no memory, no process left: nobody would notice that the node stays away
                 self._failure = NodeFailedError(f"{sentence}; it cannot be started again: {error}")
 
@@ -305,32 +265,16 @@ class Launcher:
                 time.sleep(PROGRESS_EVERY_S)
         return {}
 
-    def _stop_child(self, name: str, deadline: float) -> None:
+    def _stop_node(self, name: str, deadline: float) -> None:
         with self._lock:
-            child = self._children.get(name)
-        if child is None:
+            process = self._running.get(name)
+        if process is None:
             return
         started = time.monotonic()
-        with contextlib.suppress(psutil.Error):
-            child.peak_rss_bytes = usage_of(child.process.pid)[1]
-        self._signal(child, signal.SIGTERM)
-        if not child.ended.wait(max(0.0, deadline - time.monotonic())):
+        process.note_memory()
+        process.signal(signal.SIGTERM)
+        if not process.ended.wait(max(0.0, deadline - time.monotonic())):
             logger.warning("%s has not stopped after %.0f s and is killed", name, time.monotonic() - started)
-            self._signal(child, signal.SIGKILL)
-            if not child.ended.wait(KILL_TIMEOUT_S):  # the kernel lets go of it when the disk does
-                logger.error("%s (process %d) cannot be killed and is left", name, child.process.pid)
-
-    def _signal(self, child: _Child, number: signal.Signals) -> None:
-        with self._lock:
-            if not child.ended.is_set():
-                os.kill(child.process.pid, number)
-
-
-def _what_was_said(process: "subprocess.Popen[bytes]") -> str:
-    """Return what a process that has ended wrote to standard output, and close its pipes."""
-    assert process.stdin is not None and process.stdout is not None
-    with contextlib.suppress(BrokenPipeError):
-        process.stdin.close()
-    with process.stdout as stdout:
-        os.set_blocking(stdout.fileno(), False)  # a grandchild may still hold the other end
-        return (stdout.read() or b"").decode(errors="replace").strip()
+            process.signal(signal.SIGKILL)
+            if not process.ended.wait(KILL_TIMEOUT_S):  # the kernel lets go of it when the disk does
+                logger.error("%s (process %d) cannot be killed and is left", name, process.pid)

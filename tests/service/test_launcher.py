@@ -14,6 +14,7 @@ import pytest
 
 from seamark.frontend.types import Frame, Mode
 from seamark.service import launcher as launcher_module
+from seamark.service import node_process
 from seamark.service.bus import BusError, UnavailableError
 from seamark.service.launcher import LOST_KEYFRAMES, Launcher, NodeFailedError, StartInterruptedError
 from seamark.service.nodes.settings import NodeSettings
@@ -144,7 +145,7 @@ def test_a_node_that_cannot_be_started_again_ends_the_service(tmp_path: Path, mo
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
     with launch(tmp_path) as launcher:
-        monkeypatch.setattr(launcher_module.subprocess, "Popen", refused)
+        monkeypatch.setattr(node_process.subprocess, "Popen", refused)
         os.kill(launcher.process_id(VOCAB), signal.SIGKILL)
         with pytest.raises(NodeFailedError, match=r"the vocab node has ended.*cannot be started again"):
             wait_until(lambda: launcher.check())  # type: ignore[func-returns-value]
