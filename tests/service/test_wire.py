@@ -189,7 +189,12 @@ def test_big_endian_and_strided_arrays_arrive_as_they_look() -> None:
 
 
 @pytest.mark.parametrize(
-    "name, message", [("keyframe_v1.bin", dataclasses.replace(keyframe(), depth=b"")), ("odometry_v1.bin", odometry())]
+    "name, message",
+    [
+        ("keyframe_v1.bin", dataclasses.replace(keyframe(), depth=b"")),
+        ("keyframe_with_depth_v1.bin", keyframe()),
+        ("odometry_v1.bin", odometry()),
+    ],
 )
 def test_version_1_stays_readable(name: str, message: Any) -> None:
     assert_equal(decode((GOLDEN / name).read_bytes(), type(message)), message)
