@@ -1,7 +1,7 @@
 """A world of random points seen by pinhole cameras, independent of the code under test."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -147,7 +147,7 @@ def make_keyframe() -> Callable[[int], Keyframe]:
 
     def make(number: int) -> Keyframe:
         w = make_world(number, 200)
-        return w.view(
+        keyframe = w.view(
             np.eye(4),
             DISTORTED,
             id=number,
@@ -158,9 +158,8 @@ def make_keyframe() -> Callable[[int], Keyframe]:
             previous_id=number - 1 if number else None,
             T_odom_cam=np.linalg.qr(w.rng.normal(size=(4, 4)))[0],
             covariance=np.diag(w.rng.random(6)),
-            depth=encode_depth(
-                w.rng.uniform(1, 3, (48, 64)).astype(np.float32), 1.0, FrontendConfig(keyframe_depth_px=160)
-            ),
         )
+        depth = w.rng.uniform(1, 3, (48, 64)).astype(np.float32)
+        return replace(keyframe, depth=encode_depth(depth, 1.0, FrontendConfig(keyframe_depth_px=160)))
 
     return make
