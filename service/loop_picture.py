@@ -110,8 +110,8 @@ def _write_gates(figure: Figure, found: Explanation, top: float, total: float) -
         figure.text(0.01, y, "passed" if gate.passed else "failed", color=colour, size=8.5, weight="bold")
         figure.text(0.07, y, gate.name.replace("_", " "), color=INK, size=8.5)
         relation = "at least" if gate.least else "at most"
-        figure.text(0.27, y, f"{gate.value:.4g}", color=INK, size=8.5)
-        figure.text(0.33, y, f"{relation} {gate.limit:.4g}", color=GREY, size=8.5)
+        figure.text(0.32, y, f"{gate.value:.4g}", color=INK, size=8.5)
+        figure.text(0.385, y, f"{relation} {gate.limit:.4g}", color=GREY, size=8.5)
         y -= step
 
 
