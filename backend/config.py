@@ -192,7 +192,7 @@ class GraphConfig(_Section):
     """The pose graph and its solver."""
 
     cauchy_width: float = Field(
-        default=1.0, gt=0, description="width of the robust kernel of loops in standard deviations"
+        default=3.0, gt=0, description="width of the robust kernel of loops in standard deviations"
     )
     learn_drift: bool = Field(
         default=True, description="trust odometry more than ``drift`` says where the loops of the map bear it out"
