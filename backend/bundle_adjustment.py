@@ -98,7 +98,7 @@ def adjust(
     problem.learn_noise(first.values, kept)
     problem.learn_depth(first.values, kept)
     problem.learn_odometry(first.values)
-    second = problem.solve(first.values, kept)
+    second = problem.solve(problem.placed(first.values), kept)
     values = second.values
     before, after = (np.minimum(problem.seen.errors_px(which)[kept], LOST_PX) for which in (start, values))
     ids = np.array(sorted(known), np.int64)
@@ -180,6 +180,10 @@ class _Problem:
         solved = 1 / self.seen.depths(values)
         inverse = 1 / self.seen.points[:, 2]
         self._depths = measure(inverse, solved, sigma, kept, self.seen.pixels, list(models), camera, self._spread)
+
+    def placed(self, values: gtsam.Values) -> gtsam.Values:
+        """Return the solution with landmarks where the depths, as far as they are known now, have them."""
+        return self.seen.placed_by(self._depths.inverse, values) if self._metric else values
 
     def learn_odometry(self, values: gtsam.Values) -> None:
         """Take from the same solution how much odometry errs."""

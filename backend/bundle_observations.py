@@ -44,6 +44,23 @@ class Observations:
             values.insert(L(track), np.nanmedian(world[rows], axis=0))
         return values
 
+    def placed_by(self, inverse: NDArray[np.float64], values: gtsam.Values) -> gtsam.Values:
+        """Return the solution with each landmark where inverse depths (M,) put it, if there are any for it.
+
+        What parallax alone has placed may lie far off or behind, from where no step leads to where depths have it.
+        """
+        out = gtsam.Values(values)
+        points = self.points * (1 / (inverse * self.points[:, 2]))[:, None]
+        world = np.full((len(points), 3), np.nan)
+        for number in self._keyframes:
+            mine = self._tracks.keyframe == number
+            world[mine] = se3.transform(values.atPose3(X(number)).matrix(), points[mine])
+        for track, rows in self._rows():
+            known = rows[np.isfinite(world[rows, 0])]
+            if len(known) and out.exists(L(track)):
+                out.update(L(track), np.median(world[known], axis=0))
+        return out
+
     def errors_px(self, values: gtsam.Values) -> NDArray[np.float64]:
         """Return reprojection errors (M,); infinite for landmarks that the values lack or behind the camera."""
         out = np.full(len(self.pixels), np.inf)

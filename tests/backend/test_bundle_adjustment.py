@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L
 
 from seamark.backend.bundle_adjustment import adjust
+from seamark.backend.bundle_observations import Observations
 from seamark.backend.config import BackendConfig
 from seamark.backend.errors import MapError, SolverError
 from seamark.backend.map_open import restore
@@ -124,6 +126,45 @@ def test_warped_depth_is_found_out_by_parallax(world, move):
         warped.append(replace(keyframe, landmarks=(keyframe.landmarks * factor[:, None]).astype(np.float32)))
     result = adjust(warped, poses, dict.fromkeys(poses, 1.0), [loop], CONFIG)
     assert worst(result.T_map_cam, truth)[0] < 0.012
+
+
+def test_a_camera_that_only_turns_keeps_its_landmarks_where_depth_has_them(world, move):
+    """Test: no parallax, so that the first round may put landmarks anywhere. Expected: all are ahead again, and explain
+    what was seen to the noise.
+    """
+    w = world(5, 700)
+    truth = [move((0, 0.06 * k, 0), (0, 0, 0)) for k in range(COUNT)]
+    rng = np.random.default_rng(4)
+    poses = {k: T @ move(tuple(rng.normal(0, 0.004, 3)), tuple(rng.normal(0, 0.004, 3))) for k, T in enumerate(truth)}
+    keyframes = []
+    for k, T in poses.items():
+        own = {"id": k, "index": k, "stamp_ns": k * 10**9, "previous_id": k - 1 if k else None}
+        keyframes.append(w.view(truth[k], depth_noise=0.01, **own, T_odom_cam=T, covariance=1e-4 * np.eye(6)))
+    result = adjust(keyframes, poses, dict.fromkeys(poses, 1.0), [], CONFIG)
+    assert result.better and result.rms_px[1] < 0.8
+    assert worst(result.T_map_cam, truth)[1] < 0.0015
+    assert worst([poses[k] for k in range(COUNT)], truth)[1] > 0.004
+
+
+def test_landmarks_that_parallax_has_lost_start_where_depth_has_them(world, move):
+    keyframes, _poses, truth, _ = scene(world, move)
+    known = {k.id: k for k in keyframes}
+    pairs = neighbours(keyframes)
+    tracks = find_tracks(
+        known, pairs, {(q, m): np.linalg.inv(truth[m]) @ truth[q] for q, m in pairs}, CONFIG.verification
+    )
+    seen = Observations(known, tracks, dict.fromkeys(known, 1.0))
+    values = seen.initial(dict(enumerate(truth)))
+    before = seen.landmarks(values)
+    for track, lost in ((0, (0.0, 0.0, -50.0)), (1, (1e6, 0.0, 1e6))):
+        values.update(L(track), np.array(lost))
+    assert np.isinf(seen.errors_px(values)[tracks.track == 0]).all()
+    inverse = 1 / seen.points[:, 2]
+    inverse[tracks.track == 2] = np.nan  # it has no depth that counts and stays where it is
+    after = seen.landmarks(seen.placed_by(inverse, values))
+    np.testing.assert_allclose(after[:2], before[:2], atol=1e-9)
+    np.testing.assert_array_equal(after[2], before[2])
+    assert seen.errors_px(seen.placed_by(inverse, values))[tracks.track == 0].max() < 5
 
 
 def test_the_same_input_gives_the_same_bits(world, move):
