@@ -17,7 +17,7 @@ Matrix = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STEPS = 12
-CONVERGED = 1e-6
+CONVERGED = 1e-5  # rad, and per depth: a hundredth of a pixel
 DEPTH_PAIRS = 10  # matches with both depths from which their noise is measured
 DEPTH_OUTLIER = 4.0  # standard deviations
 NEAREST = 0.05  # of the median depth: nothing is nearer

@@ -68,18 +68,27 @@ def match_descriptors(
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
     af, bf = a.astype(np.float32), b.astype(np.float32)
-    squared = (af**2).sum(1)[:, None] + (bf**2).sum(1)[None] - 2 * af @ bf.T
-    rows, nearest = np.arange(len(a)), squared.argmin(axis=1)
-    keep = _distinct(squared, ratio) & (squared.argmin(axis=0)[nearest] == rows)
+    squared = af @ bf.T
+    squared *= -2
+    squared += (af**2).sum(1)[:, None]
+    squared += (bf**2).sum(1)
+    nearest = squared.argmin(axis=1)
+    rows = np.flatnonzero(squared.argmin(axis=0)[nearest] == np.arange(len(a)))
+    columns = nearest[rows]
+    distinct = _distinct(squared[rows], columns, ratio)
+    rows, columns = rows[distinct], columns[distinct]
     if both_ways:
-        keep &= _distinct(np.ascontiguousarray(squared.T), ratio)[nearest]
-    return np.column_stack([rows[keep], nearest[keep]]).astype(np.int64)
+        distinct = _distinct(squared[:, columns].T, rows, ratio)
+        rows, columns = rows[distinct], columns[distinct]
+    return np.column_stack([rows, columns]).astype(np.int64)
 
 
-def _distinct(squared: NDArray[np.float32], ratio: float) -> NDArray[np.bool_]:
-    """Return of which rows (N,) the nearest column beats the second nearest by the ratio."""
-    two = np.partition(squared, 1, axis=1)[:, :2]
-    return two[:, 0] < ratio**2 * two[:, 1]
+def _distinct(squared: NDArray[np.float32], nearest: NDArray[np.int64], ratio: float) -> NDArray[np.bool_]:
+    """Return of which rows (N,), which may be overwritten, the ``nearest`` column beats all others by the ratio."""
+    rows = np.arange(len(nearest))
+    best = squared[rows, nearest]
+    squared[rows, nearest] = np.inf
+    return np.asarray(best < ratio**2 * squared.min(axis=1, initial=np.inf))
 
 
 def thumbnail_of(image: NDArray[np.uint8], longer_side_px: int) -> NDArray[np.uint8]:
