@@ -21,7 +21,7 @@ class MapInfo:
     """``rows`` per table, ``bytes_of`` the large columns, ``sessions`` with their keyframes and component.
 
     ``recognisable`` keyframes have features; the others were pruned. ``accepted_loops`` stand now, ``withdrawn`` ones
-    stood once.
+    stood once. ``adjusted`` keyframes are where a full adjustment that stands has put them.
     """
 
     version: int
@@ -35,6 +35,7 @@ class MapInfo:
     withdrawn_loops: int
     reasons: dict[str, int]
     sessions: tuple[dict[str, int], ...]
+    adjusted: int
 
 
 def describe_map(path: Path) -> MapInfo:
@@ -42,6 +43,8 @@ def describe_map(path: Path) -> MapInfo:
     with MapStore(path, read_only=True) as store:
         meta, sessions = store.meta(), store.load_sessions()
         of_session = list(store.session_of_keyframes().values())
+        accepted = {(loop.query_id, loop.match_id) for loop in store.load_loops() if loop.accepted}
+        standing = [one for one in store.load_adjustments() if one.stands(accepted)]
         with store.file.reading() as database:
 
             def one(query: str) -> int:
@@ -73,6 +76,7 @@ def describe_map(path: Path) -> MapInfo:
                     }
                     for session in sessions
                 ),
+                adjusted=sum(len(one.poses) for one in standing),
             )
 
 

@@ -19,6 +19,8 @@ def info_tables(path: Path, info: MapInfo) -> list[Table]:
     keyframes = info.rows["keyframes"]
     whole.add_row("keyframes", f"{keyframes}, {info.recognisable} of them with features")
     whole.add_row("loops", f"{info.accepted_loops} of {info.rows['loops']}, {info.withdrawn_loops} withdrawn")
+    if info.adjusted:
+        whole.add_row("adjusted", f"{info.adjusted} keyframes by a full adjustment that stands")
     for reason, count in info.reasons.items():
         whole.add_row(f"  {reason}", str(count))
     for name, size in info.bytes_of.items():

@@ -11,6 +11,7 @@ from seamark.backend.contraction import contract
 from seamark.backend.errors import MapError
 from seamark.backend.graph_types import Constraint, Estimate, Graph, Node
 from seamark.backend.map_contraction import contracted
+from seamark.backend.map_info import describe_map
 from seamark.backend.map_store import MapStore
 from seamark.backend.pose_graph import PoseGraph
 from seamark.backend.solver import SolverProcess
@@ -205,6 +206,12 @@ def test_it_comes_back_from_disk_to_the_bit_and_is_replaced_as_a_whole(store: Ma
     store.record(adjustments=[stored(4, range(4, 20))])
     (found,) = store.load_adjustments()
     assert found.id == 4 and min(found.poses) == 4
+
+
+def test_map_info_counts_what_stands(store: MapStore):
+    assert describe_map(store.path).adjusted == 20
+    store.record([replace(store.load_loops()[0], accepted=False, reason=Reason.INCONSISTENT)])
+    assert describe_map(store.path).adjusted == 0
 
 
 def test_without_one_of_its_loops_nobody_believes_it(store: MapStore):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from seamark.backend.adjustment import AdjustedPose, Adjustment
 from seamark.backend.config import BackendConfig
 from seamark.backend.errors import BackendInputError
 from seamark.backend.pose_graph import PoseGraph
@@ -286,6 +287,43 @@ def test_restored_slam_goes_on_as_before(world, move):
     assert 50 not in reborn
     np.testing.assert_allclose(reborn.snapshot().T_map_cam, slam.snapshot().T_map_cam, atol=1e-3)
     assert reborn.step(keyframes[50], candidates(50, 20)).loops[0].accepted
+
+
+def test_an_adjustment_holds_through_restart_new_keyframes_and_pruning(world, move, caplog):
+    """Test: a map whose full adjustment has found the true poses is opened; a keyframe comes and closes two loops, 20
+    keyframes are forgotten, and then a loop that the adjustment rests on is withdrawn. Expected: old keyframes stay
+    within 5 mm as long as it stands; then the log says that it does not.
+    """
+    truth, keyframes, _ = ring(world, move, count=COUNT + 1)
+    slam = make_slam()
+    run(slam, keyframes[:COUNT])
+    before = slam.snapshot()
+    assert ate(before.T_map_cam, truth[:COUNT]) > 0.01
+    loops = tuple(loop for loop in before.loops if loop.accepted)
+    frame = before.T_map_cam[0] @ np.linalg.inv(truth[0])
+    poses = {k: (frame @ truth[k], 0, 1.0) for k in range(COUNT)}
+    sure = np.diag([1e-7] * 3 + [1e-6] * 3)
+    own = {k: AdjustedPose(T, 1.0, k - 1 if k else None, sure) for k, (T, _, _) in poses.items()}
+    found = Adjustment(0, own, {(loop.query_id, loop.match_id): 1.0 for loop in loops})
+    reborn = make_slam()
+    reborn.restore(keyframes[:COUNT], loops, poses, 5, adjustments=[found])
+    assert len(reborn.step(keyframes[COUNT], candidates(COUNT, LAP, 0)).loops) == 2
+    reborn.finish()
+    assert ate(reborn.snapshot().T_map_cam[:COUNT], truth[:COUNT]) < 0.005
+    change = reborn.without(range(1, 40, 2))
+    assert len(change.adjustments) == 1
+    reborn.adopt(change)
+    reborn.finish()
+    kept = reborn.snapshot().keyframe_ids
+    assert len(kept) == COUNT + 1 - 20
+    assert ate(reborn.snapshot().T_map_cam, truth[kept]) < 0.005
+    (left,) = change.adjustments
+    with caplog.at_level("WARNING"):
+        key = next(iter(left.loops))
+        reborn._loops[key] = replace(reborn._loops[key], accepted=False)  # as the judge would
+        reborn._commit([key])
+    assert "no longer stands" in caplog.text
+    assert reborn.without([45]).adjustments == ()
 
 
 def test_bad_keyframes_are_refused_by_name(world, move):
