@@ -59,6 +59,22 @@ def test_a_lone_loop_with_many_inliers_or_a_tight_cycle_needs_no_second():
     assert ledger.add(finding(truth, 134, 34, rng, offset=1.5)) == {(134, 34): Reason.INCONSISTENT}
 
 
+def test_the_chance_of_a_lone_loop_is_how_often_wrong_ones_pass():
+    """Test: 6000 poses drawn over the map in any direction, in the plane. Expected: the chance is their share."""
+    _, truth, chains = ledger_after()
+    judge, rng = PoseJudge(chains, CONFIG.consistency, planar=True), np.random.default_rng(7)
+    covariance = np.diag([1e-3, 1e-3, 0.15**2, 0.5**2, 0.5**2, 1e-3])
+    claimed = judge.lone_chance(Constraint(150, 50, np.linalg.inv(truth[50]) @ truth[150], covariance))
+    closed = 0
+    for x, y, angle in rng.uniform((-10, -10, -np.pi), (10, 10, np.pi), (6000, 3)):
+        G = np.eye(4)
+        G[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        G[:2, 3] = truth[150, :2, 3] + (x, y)
+        closed += judge.lone_chance(Constraint(150, 50, np.linalg.inv(truth[50]) @ G, covariance)) is not None
+    assert 40 < closed < 2000
+    assert 0.7 * closed / 6000 < claimed < 1.4 * closed / 6000
+
+
 def test_a_false_group_that_came_first_falls_soon_after_it_is_contradicted():
     """Test: five loops 1.5 m off, which odometry allows, then true ones. Expected: withdrawn within 20 keyframes."""
     ledger, truth, chains = ledger_after()
