@@ -225,7 +225,8 @@ class PoseGraph:
         if not np.isfinite(poses).all():
             self._isam = None
             raise SolverError(f"the pose graph of {len(ids)} keyframes has no finite solution")
-        self._poses.matrices[rows] = poses
+        free = rows >= self._held_rows  # the others are held by strong priors, which give way by micrometres
+        self._poses.matrices[rows[free]] = poses[free]
         self._new_loops.clear()
 
     def _factors(self, rows: Sequence[int], loops: Iterable[Key]) -> gtsam.NonlinearFactorGraph:
