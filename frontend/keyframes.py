@@ -52,7 +52,7 @@ class KeyframeBuilder:
     def __init__(self, rig: Rig | None, mode: Mode, config: FrontendConfig, sensor: DepthSensor) -> None:
         self._rig, self._mode, self._config, self._sensor = rig, mode, config, sensor
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
-        self._way = native.RightOfWay()
+        self.way = native.RightOfWay()
         self._pending: deque[Future[list[Keyframe]]] = deque()
         self._ready: list[Keyframe] = []
         self._recent: deque[Keyframe] = deque(maxlen=config.recovery_keyframes)
@@ -86,11 +86,11 @@ class KeyframeBuilder:
     def tracking(self) -> Iterator[None]:
         """Have the right of way over the thread, unless it has fallen behind."""
         if sum(not made.done() for made in self._pending) <= UNHURRIED:
-            self._way.take()
+            self.way.take()
         try:
             yield
         finally:
-            self._way.give_back()
+            self.way.give_back()
 
     def take(self) -> tuple[Keyframe, ...]:
         """Hand out the keyframes that are ready, without waiting."""
@@ -114,7 +114,7 @@ class KeyframeBuilder:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _collect(self) -> None:
-        self._way.give_back()  # who waits for the thread does not hold it up
+        self.way.give_back()  # who waits for the thread does not hold it up
         keyframes = self._pending.popleft().result()
         self._recent.extend(keyframes)
         self._ready.extend(keyframes)
@@ -134,7 +134,7 @@ class KeyframeBuilder:
 
     def _make(self, request: KeyframeRequest) -> Keyframe:
         frame, c = request.frame, self._config
-        features = extract_features(frame.image, c.sift_features, c.sift_contrast, frame.mask, c.sift_pixels, self._way)
+        features = extract_features(frame.image, c.sift_features, c.sift_contrast, frame.mask, c.sift_pixels, self.way)
         ok, jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, c.jpeg_quality])
         assert ok, "an 8-bit image can be encoded"
         return Keyframe(

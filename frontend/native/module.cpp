@@ -279,6 +279,7 @@ NB_MODULE(_native, m) {
           "image"_a.noconvert());
     nb::class_<RightOfWay>(m, "RightOfWay")
         .def(nb::init<>())
+        .def_prop_ro("taken", &RightOfWay::taken)
         .def("take", &RightOfWay::take)
         .def("give_back", &RightOfWay::give_back);
     m.def("sift", &sift_of, "image"_a.noconvert(), "mask"_a.noconvert().none(), "most"_a, "contrast"_a, "way"_a.none() = nb::none());

@@ -15,9 +15,10 @@ class RightOfWay {
 public:
     void take() { taken_.store(true, std::memory_order_relaxed); }
     void give_back() { taken_.store(false, std::memory_order_relaxed); }
+    bool taken() const { return taken_.load(std::memory_order_relaxed); }
 
     void let_pass() {
-        for (int look = 0; taken_.load(std::memory_order_relaxed); ++look) {
+        for (int look = 0; taken(); ++look) {
             if (look == kLooks) return give_back();
             std::this_thread::sleep_for(std::chrono::milliseconds(1));
         }

@@ -71,6 +71,22 @@ def lap_pairs(count=200, every=5):
     return [(q, q - count // 2) for q in range(count // 2, count, every)]
 
 
+def test_honest_loops_keep_most_of_their_weight_and_wrong_ones_none():
+    """Test: loops with the noise they claim beside odometry that is nearly exact, one off by 17 deviations."""
+    truth, _ = two_laps(0)
+    nodes = [Node(k, 0, k - 1 if k else None, T, 1e-4 * EDGE) for k, T in enumerate(truth)]
+    graph = PoseGraph(CONFIG)
+    graph.add_keyframes(nodes)
+    loops = list(true_loops(truth, np.random.default_rng(1), [(k, k - 100) for k in range(110, 190, 2)]))
+    wrong = replace(loops[0], T_match_query=loops[0].T_match_query @ exp((0, 0, 0), (0.5, 0, 0)))
+    graph.add_loops([wrong, *loops[1:]])
+    graph.optimise()
+    weights = graph.weights()
+    # 1 / (1 + 6 / 9) where errors are as long as six degrees of freedom make them, more as the poses yield to them.
+    assert 0.6 < np.mean([weights[loop.key] for loop in loops[1:]]) < 0.95
+    assert weights[wrong.key] < 0.05
+
+
 def test_loops_remove_drift():
     """Test: loops as found one by one. Expected: the error falls to what the loops' own noise allows, not to zero."""
     truth, nodes = two_laps(1, bias_deg=0.12)

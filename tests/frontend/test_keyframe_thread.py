@@ -1,7 +1,7 @@
 """The thread that makes what keyframes carry, beside the one that tracks."""
 
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from seamark.frontend.depth import NoDepth
 from seamark.frontend.features import extract_features
 from seamark.frontend.kernels import native
 from seamark.frontend.keyframes import UNHURRIED, KeyframeBuilder
-from seamark.frontend.types import Frame, Mode
+from seamark.frontend.types import Frame, Keyframe, Mode
 
 
 def noise(height: int, width: int) -> NDArray[np.uint8]:
@@ -47,14 +47,35 @@ def test_patience_ends() -> None:
 
 
 def test_a_thread_that_has_fallen_behind_is_not_held_up() -> None:
-    """Test: many keyframes, then tracking without end. Expected: all are made while tracking goes on, in order."""
+    """Test: tracking beside an idle thread, and beside one with a long queue. Expected: the way is taken from the first
+    only and given back at the end, and all keyframes come in order."""
     builder = KeyframeBuilder(None, Mode.PLACES, FrontendConfig(), NoDepth())
-    image = noise(120, 160)
+    image = noise(480, 640)
+    with builder.tracking():
+        assert builder.way.taken
+    assert not builder.way.taken
     for index in range(UNHURRIED + 3):
         builder.submit([builder.request(Frame(index, index, image), session=0)])
     with builder.tracking():
-        deadline, made = time.monotonic() + 20, list(builder.take())
-        while len(made) < UNHURRIED + 3 and time.monotonic() < deadline:
-            made += builder.take()
-    assert [keyframe.id for keyframe in made] == list(range(UNHURRIED + 3))
+        assert not builder.way.taken
+    builder.wait()
+    assert [keyframe.id for keyframe in builder.take()] == list(range(UNHURRIED + 3))
+    builder.close()
+
+
+def test_who_waits_for_keyframes_while_tracking_does_not_hold_them_up() -> None:
+    """Test: a search for the last place in the midst of a step. Expected: the way is free while it is waited for."""
+    builder = KeyframeBuilder(None, Mode.PLACES, FrontendConfig(), NoDepth())
+    taken_while_waiting = []
+
+    class Pending(Future[list[Keyframe]]):
+        def result(self, timeout: float | None = None) -> list[Keyframe]:
+            taken_while_waiting.append(builder.way.taken)
+            return []
+
+    builder._pending.append(Pending())
+    with builder.tracking():
+        assert builder.way.taken
+        assert builder.recent(0) == []
+    assert taken_while_waiting == [False]
     builder.close()
